@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -24,17 +23,6 @@ _ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
 # The library stores members uncompressed. A repacked zip may deflate them; then the budget is
 # charged twice the unpacked size, because Python joins the pieces.
 _COPIES = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 2}
-
-# Python's exceptions for zips that are damaged, encrypted, or of an unknown kind.
-_DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    OSError,
-    EOFError,
-    OverflowError,
-    RuntimeError,
-    ValueError,
-)
 
 
 def read_members(content: bytes, budget: Budget | None = None) -> dict[str, bytes]:
@@ -77,7 +65,7 @@ def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
             yield archive
     except UnsafeFileError:
         raise
-    except _DAMAGE as error:
+    except Exception as error:  # damaged, encrypted, or of an unknown kind
         raise UnsafeFileError(f"is no whole zip: {error}") from error
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
@@ -57,8 +57,7 @@ def load_replay_buffer(
     for name in ("observation_space", "action_space"):
         if vars(buffer).get(name) != getattr(model, name):
             raise UnsafeFileError(f"holds transitions of another {name} than the agent's")
-    for name in _ROWS:
-        _check_rows(buffer, name)
+    _check_rows(vars(buffer))
     buffer.device = model.device
     if isinstance(buffer, HerReplayBuffer):
         assert model.env is not None, "HerReplayBuffer needs an environment"
@@ -68,14 +67,15 @@ def load_replay_buffer(
     model.replay_buffer = buffer
 
 
-def _check_rows(buffer: ReplayBuffer, name: str) -> None:
-    """Check that an array, or a dictionary of arrays, has the buffer's rows of finite numbers."""
-    held = vars(buffer).get(name, {})
-    shape = (vars(buffer).get("buffer_size"), vars(buffer).get("n_envs"))
-    for array in held.values() if isinstance(held, dict) else [held]:
-        fits = isinstance(array, np.ndarray) and array.shape[:2] == shape
-        if not fits or not (name == "infos" or np.isfinite(array).all()):
-            raise UnsafeFileError(f"holds a replay buffer with wrong {name}")
+def _check_rows(state: Mapping[str, Any]) -> None:
+    """Check that the arrays have the buffer's rows, and finite numbers."""
+    for name in _ROWS:
+        held = state.get(name, {})
+        for array in held.values() if isinstance(held, dict) else [held]:
+            fits = array.shape[:2] == (state.get("buffer_size"), state.get("n_envs"))
+            is_finite = array.dtype == object if name == "infos" else np.isfinite(array).all()
+            if not (fits and is_finite):
+                raise UnsafeFileError(f"holds a replay buffer with wrong {name}")
 
 
 # --- statistics -----------------------------------------------------------------------------------
@@ -102,11 +102,8 @@ def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
     Raises:
         UnsafeFileError: if the file has no such statistics, or they do not fit the environments.
     """
-    found, space = (
-        read_normalization(content_of(path, MAX_STATISTICS_BYTES)),
-        venv.observation_space,
-    )
-    known = found.observation_space
+    found = read_normalization(content_of(path, MAX_STATISTICS_BYTES))
+    known, space = found.observation_space, venv.observation_space
     if type(known) is not type(space) or known.shape != space.shape:
         raise UnsafeFileError(f"holds statistics of {known}, not of {space}")
     normalized = VecNormalize(venv, **found.settings)

@@ -72,18 +72,11 @@ def _dtype(made: Made, build: Build) -> np.dtype[Any]:
 
 
 def _array(data: Any, dtype: Any, shape: Any, order: Any = "C") -> NDArray[Any]:
-    shape = (shape,) if isinstance(shape, int) else shape
-    # Arrays of objects hold dictionaries and plain values, such as the infos of a replay buffer.
-    size = 1 if dtype.hasobject else dtype.itemsize
-    if isinstance(data, list) is not dtype.hasobject or len(data) != math.prod(shape) * size:
-        raise UnsafeFileError("holds an array whose size does not match its data")
-    if not dtype.hasobject:
-        # A copy, because an array on bytes is read-only.
-        return np.frombuffer(data, dtype).reshape(shape, order=order).copy(order=order)
-    flat = np.empty(len(data), dtype=object)
-    for index, value in enumerate(data):
-        flat[index] = value
-    return flat.reshape(shape, order=order)
+    if isinstance(data, list) is not dtype.hasobject:
+        raise TypeError("an array of objects has a list of them, others have bytes")
+    flat = np.fromiter(data, object) if dtype.hasobject else np.frombuffer(data, dtype)
+    # A copy, because an array on bytes is read-only.
+    return flat.reshape(shape, order=order).copy(order=order)
 
 
 def _from_buffer(made: Made, build: Build) -> NDArray[Any]:
@@ -148,14 +141,13 @@ def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
     storages: dict[str, th.Tensor] = {}
     try:
         # The name of a member begins with that of a folder.
-        members = {
-            name.partition("/")[2]: held for name, held in read_members(content, budget).items()
-        }
+        records = read_members(content, budget).items()
+        members = {name.partition("/")[2]: record for name, record in records}
 
         def storage(made: Made, build: Build) -> th.Tensor:
             """A storage, which the file may name several times."""
             key = made.args[0][2]
-            if not isinstance(key, str):
+            if not isinstance(key, str):  # hashing a nested tuple can take for ever
                 raise wrong(made)
             if key not in storages:
                 storages[key] = _flat(made.args[0], members.pop(f"data/{key}"))

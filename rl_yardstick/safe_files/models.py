@@ -94,13 +94,13 @@ def load_model(
     content = content_of(path, MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
     members = read_model_members(content, budget)
-    plain, pickled = _read_settings(members, algorithm, budget)
+    settings = _read_settings(members, algorithm, budget)
     known = {**by_name(algorithm.policy_aliases.values()), **(classes or {})}
-    given = custom_objects or {}
-    objects = {name: given[name] for name in given if name in plain or name in pickled}
+    objects = {name: held for name, held in (custom_objects or {}).items() if name in settings}
+    pickled = {name: held for name, held in settings.items() if isinstance(held, bytes)}
     for key in pickled.keys() - objects - replaced.keys():
         try:
-            objects[key] = read_pickle(_decoded(pickled[key]), known, budget=budget)
+            objects[key] = read_pickle(pickled[key], known, budget=budget)
         except UnsafeFileError as error:
             raise UnsafeFileError(f"{key} {error}", key) from error
     names = [name for name in members if name.endswith(TENSORS)]
@@ -108,9 +108,9 @@ def load_model(
     check_values(tensors)
     try:
         _check_variables(tensors, algorithm)
-        _check_buffers({**plain, **objects, **replaced})
+        _check_buffers({**settings, **objects, **replaced})
         # The library applies only custom objects whose keys are in the file.
-        checked = _zipped({**plain, **dict.fromkeys(objects)}, tensors)
+        checked = _zipped({**settings, **dict.fromkeys([*pickled, *objects])}, tensors)
         with charged_tensors(budget):
             return algorithm.load(checked, env, device, objects, **replaced)
     except ValueError:
@@ -122,20 +122,14 @@ def load_model(
 
 def _read_settings(
     members: Mapping[str, bytes], algorithm: type[BaseAlgorithm], budget: Budget
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The plain attributes in a zip, and the pickles of the others as text."""
-    plain: dict[str, Any] = {}
-    pickled: dict[str, Any] = {}
-    for key, value in parse_settings(members, budget).items():
-        if key in _NOT_READ:
-            continue
+) -> dict[str, Any]:
+    """The attributes in a zip; pickles are bytes."""
+    settings = parse_settings(members, budget)
+    read = {key: _decoded(value) for key, value in settings.items() if key not in _NOT_READ}
+    for key in read:
         if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
             raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
-        if isinstance(value, dict) and _SERIALIZED in value:
-            pickled[key] = value[_SERIALIZED]
-        else:
-            plain[key] = value
-    return plain, pickled
+    return read
 
 
 def hides(algorithm: type, name: str) -> bool:
@@ -143,12 +137,14 @@ def hides(algorithm: type, name: str) -> bool:
     return not isinstance(inspect.getattr_static(algorithm, name, None), _PLAIN)
 
 
-def _decoded(text: Any) -> bytes:
-    """Decode a pickle from base64 in JSON."""
+def _decoded(value: Any) -> Any:
+    """An attribute in JSON; its pickle, if it has one, which JSON holds as base64."""
+    if not (isinstance(value, dict) and _SERIALIZED in value):
+        return value
     try:
-        return base64.b64decode(text, validate=True)
+        return base64.b64decode(value[_SERIALIZED], validate=True)
     except (TypeError, ValueError) as error:
-        raise UnsafeFileError(f"is damaged: {error}") from error
+        raise UnsafeFileError(f"holds a damaged pickle: {error}") from error
 
 
 def _check_variables(tensors: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> None:
@@ -238,7 +234,8 @@ def inspect_model(path: Path | str) -> dict[str, dict[str, str]]:
     for name, held in members.items():
         found["members"][_quoted(name)] = f"{len(held):,} bytes"
         try:
-            tensors = {name: load_tensors(held, budget)} if name.endswith(TENSORS) else {}
+            is_tensors, stem = name.endswith(TENSORS), name.removesuffix(TENSORS)
+            tensors = {stem: load_tensors(held, budget)} if is_tensors else {}
             check_values(tensors)
             for where, tensor in tensors_in(tensors):
                 found["weights"][_quoted(where)] = str(tuple(tensor.shape))
@@ -255,9 +252,9 @@ def _setting(key: str, value: Any, budget: Budget) -> str:
     """An attribute in one line; UnsafeFileError if it is suspicious."""
     if key in _NOT_KEPT and value:
         raise UnsafeFileError("is set, which models do not keep")
-    if not (isinstance(value, dict) and _SERIALIZED in value):
+    pickled = _decoded(value)
+    if not isinstance(pickled, bytes):
         return shown(value)
-    pickled = _decoded(value[_SERIALIZED])
     reader = Reader(io.BytesIO(pickled), budget)
     reader.load()
     names = [_quoted(name) for name in sorted(reader.names)]

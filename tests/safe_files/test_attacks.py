@@ -91,7 +91,6 @@ ATTACKS = {
     "a key that is an object": b"}" + DEQUE + b")RNs",
     "a long number of a megabyte": b"\x8b" + struct.pack("<i", 10**6) + bytes(10**6 - 1) + b"\x7f",
     "an array of no number": array(bytes(8), NAN + b"\x85"),
-    "an array of -1 numbers": array(bytes(8), b"J\xff\xff\xff\xff\x85"),
     "an array of 65 dimensions": array(bytes(8), b"(" + b"K\x01" * 65 + b"t"),
     "a deque of a length below 0": DEQUE + b")J\xfb\xff\xff\xff\x86R",
 }  # fmt: skip
