@@ -121,6 +121,7 @@ def _job_queue(path: Path, n_jobs: int) -> Any:
     if n_jobs < 1:
         raise UserError(f"{path}: say how many runs to do at once: --jobs N")
     settings = {str(name).replace("_", "-"): value for name, value in given.items()}
+    settings["processes"] = settings.get("cores")  # one run in each
     # The library's own defaults for what the file leaves out.
     dask.config.set({f"jobqueue.{system}": {**dask.config.get(f"jobqueue.{system}"), **settings}})
     cluster = getattr(dask_jobqueue, QUEUES[system])()

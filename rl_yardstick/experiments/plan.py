@@ -328,12 +328,17 @@ class StudyRecord:
             raise UserError(f"{root} is no study: it has no {RECORD}")
         data = read_json(root / RECORD, MAX_RECORD)
         try:
+            study = _STUDY.validate_python(data["study"])
+            # A record of a stranger names no module and no place outside the folder.
+            own = {"gym_packages": [*study.gym_packages], "trained_agent": None}
+            own |= {"tensorboard_log": None, "watch_learning": None}
             specs = {
-                (str(one["agent"]), str(one["environment"])): TrainSpec.model_validate(one["spec"])
+                (str(one["agent"]), str(one["environment"])): TrainSpec.model_validate(
+                    {**one["spec"], **own}
+                )
                 for one in data["specs"]
             }
-            looks = tuple(map(int, data["looks"]))
-            return cls(_STUDY.validate_python(data["study"]), specs, looks)
+            return cls(study, specs, tuple(map(int, data["looks"])))
         except (ValidationError, LookupError, TypeError, ValueError) as error:
             raise UserError(f"{root / RECORD} is no study of this version") from error
 
