@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 
 from rl_yardstick.commands.terminal import TextConsole
-from rl_yardstick.experiments.off_policy.estimators import PolicyTerms
-from rl_yardstick.experiments.off_policy.logged_policies import Comparison, Judged
+from rl_yardstick.experiments.off_policy import Comparison, Judged, PolicyTerms
 from rl_yardstick.report.terminal import (
     folded,
     print_analysis,
