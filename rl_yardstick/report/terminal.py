@@ -222,10 +222,9 @@ def _width(console: Console, table: Table) -> int:
 FEW_PULLS = 100
 SHORT, MOST_DECIMALS = 3, 6
 # The estimates of a policy, by heading.
-ESTIMATES = {"IPS": "ips", "self-normalised": "snips", "direct": "direct"}
-ESTIMATES["doubly robust"] = "doubly_robust"
+ESTIMATES = {"IPS": "ips", "self-normalised": "snips", "doubly robust": "doubly_robust"}
 # Columns to drop, in this order, while the table is wider than the terminal.
-OFF_POLICY_LEFT_OUT = ("IPS", "self-normalised", "direct", "effective")
+OFF_POLICY_LEFT_OUT = ("IPS", "self-normalised", "effective")
 
 
 def print_comparison(console: Console, comparison: Comparison) -> None:

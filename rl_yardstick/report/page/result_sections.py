@@ -308,10 +308,9 @@ def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
     for run in results.planned:
         if run.path in there:
             continue
-        failure, error = results.failures.get(run.path), run.path / ERROR_FILE
-        details = read_text(error).strip() if failure and error.exists() else ""
-        reason = unreadable.get(run.path) or details.rpartition("\n")[2] or failure
-        reason = reason or "not done yet"
+        details, error = results.failures.get(run.path, ""), run.path / ERROR_FILE
+        details = (read_text(error) if details and error.exists() else details).strip()
+        reason = unreadable.get(run.path) or details.rpartition("\n")[2] or "not done yet"
         new = {"agent": run.agent, "environment": run.environment, "reason": reason, "seeds": []}
         group = groups.setdefault((run.agent, run.environment, reason), new)
         group["seeds"].append(run.seed)

@@ -29,7 +29,6 @@ from rl_yardstick.report.series import (
     Curve,
     Pulls,
     PullSeries,
-    astype,
     mean_of,
     mean_regret,
     regret_of_runs,
@@ -232,7 +231,7 @@ def _read_maps(
 
 def _digits(numbers: NDArray[Any]) -> str:
     """Numbers below ten as one text, which is shortest."""
-    return "".join(map(str, astype(np.int64).tolist()))
+    return "".join(map(str, numbers.astype(np.int64).tolist()))
 
 
 MOST_FILMED = 8  # agents of an environment, the best of them
