@@ -24,8 +24,8 @@ from rl_yardstick.pipeline.errors import UserError, shown, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
+    from rich.console import Console
 
-    from rl_yardstick.commands.terminal import TextConsole
     from rl_yardstick.experiments.analysis import StudyAnalysis
     from rl_yardstick.experiments.plan import PlannedRun, StudyRecord
     from rl_yardstick.experiments.pool import Workers
@@ -173,7 +173,7 @@ class Job:
 
     root: Path  #: the folder of the study
     command: str  #: recorded in run folders
-    console: TextConsole
+    console: Console
     stop: Stop
     workers: Workers
     with_page: bool = True  #: draw the figures and write the page, beside the tables
