@@ -153,7 +153,10 @@ def typed(monkeypatch, capsys):
     def run(*words):
         name = str(words[0]).removesuffix(".py")
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *(str(word) for word in words[1:])])
+        handlers = {number: signal.getsignal(number) for number in SIGNALS}
         code = commands._exit_code(name)
+        for number, handler in handlers.items():  # the process would end with its command
+            signal.signal(number, handler)
         captured = capsys.readouterr()
         return code, captured.out, captured.err
 

@@ -15,17 +15,13 @@ from rl_yardstick.commands.cli import (
     whole_number,
     with_engine,
 )
+from rl_yardstick.diagnosis.faults import FAULTS, KINDS
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.audit import Verdict
     from rl_yardstick.diagnosis.subjects import Subject
 
-# As in `diagnosis.subjects`, which takes long to import.
-KINDS = (
-    *("q_learning", "off_policy_monte_carlo", "sarsa", "expected_sarsa"),
-    *("actor_critic", "policy_gradient"),
-)
 WORDS = {"ok": "ok", "fault": "FAULT", "unsaid": "nothing can be said", "skipped": "skipped"}
 
 EPILOG = """\
@@ -56,7 +52,7 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add_shared(parser, "--gym-packages", "--engine")
     add_shared(parser, "--hyperparams", help="hyperparameters to change, e.g. learning_rate:0.01")
-    add("--kind", choices=KINDS, help="the kind of algorithm (default: as its class)")
+    add("--kind", choices=[*KINDS], help="the kind of algorithm (default: as its class)")
     choices = ("discrete", "box")
     spaces = "kind of {} (default: the first that works)"
     add("--observations", choices=choices, help=spaces.format("observations: numbers or vectors"))
@@ -123,8 +119,6 @@ def _subject(args: argparse.Namespace) -> Subject:
 
 def verdict_lines(verdict: Verdict) -> list[str]:
     """The verdict, in a few lines."""
-    from rl_yardstick.diagnosis.faults import FAULTS
-
     unsaid = [finding.probe for finding in verdict.findings if finding.state == "unsaid"]
     if not verdict.faults:
         if not verdict.is_right:

@@ -24,8 +24,8 @@ from rl_yardstick.pipeline.errors import UserError, shown, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
+    from rich.console import Console
 
-    from rl_yardstick.commands.terminal import TextConsole
     from rl_yardstick.experiments.analysis import StudyAnalysis
     from rl_yardstick.experiments.plan import PlannedRun, StudyRecord
     from rl_yardstick.experiments.pool import Workers
@@ -138,7 +138,7 @@ def main() -> int:
 
     stop = Stop().listen()
     ids = [split_id(env_id) for env_id in args.env]
-    args.gym_packages += [module for module, _ in ids if module]
+    args.gym_packages = [*args.gym_packages, *(module for module, _ in ids if module)]
     args.env = [env_id for _, env_id in ids]
     import_modules(args.gym_packages)
     if args.logged or args.policy:
@@ -173,7 +173,7 @@ class Job:
 
     root: Path  #: the folder of the study
     command: str  #: recorded in run folders
-    console: TextConsole
+    console: Console
     stop: Stop
     workers: Workers
     with_page: bool = True  #: draw the figures and write the page, beside the tables
@@ -416,7 +416,7 @@ def _draw(job: Job, analysis: StudyAnalysis, blocks: pd.DataFrame | None) -> lis
         from rl_yardstick.report.page.learning import write_first_pages
 
         with job.console.status("watching"):
-            learning = write_first_pages(analysis, job.workers.n_at_once)
+            learning = write_first_pages(analysis, job.workers.n_at_once, job.stop)
     with job.console.status("writing the page"):
         write_report(Report(series, job.command, learning=learning), root / "report.html")
     return [*files, *(root / one.place for one in learning if one.place), root / "report.html"]

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 FRAMES_PER_SECOND = 4  # of --render ansi
 LONGEST_REPETITION = 20  # frames of an episode in a row that were all shown before
-STEPS = whole_number(1, besides={-1: "as many as the episodes take"})
-RUN_NUMBER = whole_number(0, besides={-1: "the run without a number"})
 
 EPILOG = """\
 examples:
@@ -55,7 +53,8 @@ def build_parser() -> argparse.ArgumentParser:
     add_model_flags(parser)
     group = parser.add_argument_group("playing")
     add = group.add_argument
-    add("-n", "--n-timesteps", type=STEPS, default=-1, metavar="N", help="stop after N steps")
+    steps = whole_number(1, besides={-1: "as many as the episodes take"})
+    add("-n", "--n-timesteps", type=steps, default=-1, metavar="N", help="stop after N steps")
     episodes = "episodes to play (default: 10, or as many as end within the steps of -n)"
     add("--n-episodes", type=COUNT, metavar="N", help=episodes)
     add("--n-envs", type=COUNT, default=1, metavar="N", help="environments to play on at once (1)")
@@ -86,7 +85,8 @@ def add_model_flags(parser: argparse.ArgumentParser) -> None:
     add("--env", type=filled, help="environment id (default: CartPole-v1, or as in the folder)")
     add("-f", "--folder", type=filled, default="logs", help="folder of all runs (default: logs)")
     number = "number of the run (default: 0, the newest; -1 for FOLDER/ALGO/ENV.zip itself)"
-    add("--exp-id", type=RUN_NUMBER, default=0, metavar="N", help=number)
+    numbers = whole_number(0, besides={-1: "the run without a number"})
+    add("--exp-id", type=numbers, default=0, metavar="N", help=number)
     add("--load-best", action="store_true", help="the model with the best evaluation in training")
     add("--load-checkpoint", type=whole_number(0), metavar="STEPS", help="that checkpoint")
     add("--load-last-checkpoint", action="store_true", help="the last checkpoint")
@@ -168,12 +168,10 @@ def render_mode(args: argparse.Namespace) -> RenderMode | None:
 def play(console: Console, found: Model, args: argparse.Namespace) -> None:
     """Play episodes, show or film them, and print their returns and the policy's exact return."""
     with console.status("loading the agent"):
-        import numpy as np
         import torch as th
         from gymnasium.error import DependencyNotInstalled
 
-        from rl_yardstick.commands.terminal import figures, result_lines, say
-        from rl_yardstick.pipeline.evaluation.sampled import Evaluation, bracketed_yardstick
+        from rl_yardstick.commands.terminal import result_lines, say
         from rl_yardstick.pipeline.models import load_agent
         from rl_yardstick.pipeline.playing import play_episodes, playing_env, write_film
 
@@ -188,8 +186,8 @@ def play(console: Console, found: Model, args: argparse.Namespace) -> None:
     show = LiveShow(console, env, agent, args.fps) if is_live else Show(console, env, mode)
     n_steps = args.n_timesteps if args.n_timesteps > 0 else None
     n_episodes = 10 if args.n_episodes is None and n_steps is None else args.n_episodes
-    given = {"deterministic": not args.stochastic}
-    given |= {"before_step": show.before_step, "after_step": show.after_step}
+    given: Any = {"before_step": show.before_step, "after_step": show.after_step}
+    given |= {"deterministic": not args.stochastic}
     try:
         with console.status("playing") if mode != "ansi" else show.live:
             for episode in play_episodes(agent, env, n_episodes, n_steps, **given):
@@ -202,18 +200,28 @@ def play(console: Console, found: Model, args: argparse.Namespace) -> None:
         with console.status("writing the film"):
             write_film(Path(args.record), show.frames)
         say(console, f"film: {args.record}")
-    if show.played:
-        played = Evaluation(*np.array(show.played, dtype=np.float64).T, None)
-        if not args.norm_reward:
-            played = played.measured_by(bracketed_yardstick(spec))
-        for line in result_lines(played, f"length {figures(played.mean_length)[0]}"):
-            say(console, line)
-    else:
-        say(console, "no episode came to its end: raise --n-timesteps")
+    for line in played_lines(spec, show, args.norm_reward):
+        say(console, line)
     with console.status("computing the policy's expected return"):
         exact = expected_return(spec, agent, not args.stochastic)
     for line in [exact] if isinstance(exact, str) else result_lines(exact) if exact else []:
         say(console, line)
+
+
+def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
+    """The mean return, beside the optimum if a bracket of that is known."""
+    if not show.played:
+        return ["no episode came to its end: raise --n-timesteps"]
+    import numpy as np
+
+    from rl_yardstick.commands.terminal import figures, result_lines
+    from rl_yardstick.pipeline.evaluation.sampled import Evaluation, bracketed_yardstick
+
+    returns, lengths = np.array(show.played, dtype=np.float64).T
+    played = Evaluation(returns, lengths, None)
+    if not is_normalised:
+        played = played.measured_by(bracketed_yardstick(spec))
+    return result_lines(played, f"length {figures(played.mean_length)[0]}")
 
 
 def expected_return(spec: TrainSpec, agent: Any, deterministic: bool) -> Evaluation | str | None:

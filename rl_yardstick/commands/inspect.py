@@ -1,4 +1,4 @@
-"""``yardstick inspect``: the content of a model file, read without running any of it."""
+"""``yardstick inspect``: the content of a model file, read without running any of it."""  # noqa: A005
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ def main() -> int:
     from rl_yardstick.pipeline.run import Run, Stop
 
     module, args.env = split_id(args.env)
-    args.gym_packages += [module] if module else []
+    args.gym_packages = [*args.gym_packages, *filter(None, [module])]
     import_modules(args.gym_packages)
     if args.list:
         from rl_yardstick.commands.lists import print_lists

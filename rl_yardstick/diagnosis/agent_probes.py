@@ -15,15 +15,7 @@ from typing import Any
 import numpy as np
 
 from rl_yardstick.diagnosis.faults import UNEXPLAINED, Finding, checked
-from rl_yardstick.diagnosis.probe_worlds import (
-    ARM_0,
-    ARM_1,
-    CHAIN,
-    COIN,
-    EQUAL_ARMS,
-    SAFE_FORK,
-    World,
-)
+from rl_yardstick.diagnosis.probe_worlds import ARM_0, CHAIN, SAFE_FORK, World
 from rl_yardstick.diagnosis.subjects import ClassSubject, Lab, Subject, Trained, TrainedModel
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import one_line
@@ -31,7 +23,7 @@ from rl_yardstick.pipeline.errors import one_line
 
 def probe_choice(lab: Lab) -> Finding:
     """The agent learns the action that pays, and always takes it in evaluation."""
-    trained = [lab.begin(world) for world in (ARM_0, ARM_1)]
+    trained = [lab.begin(world) for world in (ARM_0, World(((0, 1),)))]
     chosen = [float(np.mean([each.act(0) for _ in range(400)])) for each in trained]
     text = (
         f"it does action 1 in {chosen[0]:.1%} of 400 where 0 pays, in {chosen[1]:.1%} where 1 does"
@@ -54,7 +46,7 @@ def probe_entropy(lab: Lab) -> Finding | None:
         return None
     spreads = []
     for weight in (1e-3, 0.5):
-        trained = lab.begin(EQUAL_ARMS, ent_coef=weight)
+        trained = lab.begin(World(((0, 0),)), ent_coef=weight)
         assert isinstance(trained, TrainedModel)
         spreads.append(float(trained.drawn_actions(0, 1000).std()))
     low, high = spreads
@@ -102,7 +94,7 @@ def _moves(lab: Lab, subject: ClassSubject, schedule: Any) -> tuple[float, float
     """How much values move from one reading to the next, early in a training and late."""
     from stable_baselines3.common.callbacks import BaseCallback
 
-    trained = subject.start(COIN, lab.seed, {"learning_rate": schedule})
+    trained = subject.start(World(((0, 0),), noise=1.0), lab.seed, {"learning_rate": schedule})
     rollout = int({**subject.base, **subject.typed}.get("n_steps", 1))
     every = max(20, rollout) if subject.is_on_policy else 20
     readings: list[Floats] = []

@@ -1,4 +1,4 @@
-"""The faults that an audit can name, with the sources of what is right, and findings."""
+"""What algorithms claim to be, the faults that an audit can name with sources, and findings."""
 
 from __future__ import annotations
 
@@ -6,6 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+# The next value in a target: that of the best action; that of the learner's next action; or the
+# state's under the learner's policy, for learners without action values.
+Target = Literal["maximises", "follows", "states"]
+KINDS: Mapping[str, Target] = {
+    "q_learning": "maximises",
+    "off_policy_monte_carlo": "maximises",
+    "sarsa": "follows",
+    "expected_sarsa": "follows",
+    "actor_critic": "states",
+    "policy_gradient": "states",
+}
 BOOK = "Sutton and Barto (2nd edition)"
 
 

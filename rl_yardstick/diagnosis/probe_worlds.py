@@ -182,15 +182,5 @@ def make_env(
 
 
 CHAIN = World(((0, 0), (1, 1)))
-SEES_START = World(((0, 0), (1, 1)), end_shows=0)
-START_PAYS = World(((5, 5), (1, 1)))
-END_PAYS_MORE = World(((0, 0), (2, 2)))
-LOOP = World(((0, 0), (1, 1)), ends=False, cut=4)
-LOOP_START_PAYS = World(((5, 5), (1, 1)), ends=False, cut=4)
-LONG_LOOP = World(((0, 0), (1, 1)), ends=False, cut=40)
 SAFE_FORK = World(((0, 0), (1, 0)))
-DEAR_FORK = World(((0, 0), (1, -4)))
-ARM_0, ARM_1 = World(((1, 0),)), World(((0, 1),))
-EQUAL_ARMS = World(((0, 0),))
-COIN = World(((0, 0),), noise=1.0)
-STAIRS = World(((0.5, 0.5), (0, 0), (1, 1), (0, 0), (1, 1)))
+ARM_0 = World(((1, 0),))

@@ -9,11 +9,13 @@ from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from itertools import product
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rl_yardstick.agents.registry import ALGORITHMS, AlgorithmEntry, load_algorithm
+from rl_yardstick.diagnosis.faults import KINDS, Target
 from rl_yardstick.diagnosis.probe_worlds import (
     Actions,
     Observations,
@@ -27,24 +29,13 @@ from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.arguments import arguments_of, check_arguments, constructor_parameters
 from rl_yardstick.pipeline.components import constructor_arguments
 from rl_yardstick.pipeline.errors import UserError, one_line, unknown
-from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.settings import validated
 
 if TYPE_CHECKING:
     from stable_baselines3.common.callbacks import BaseCallback
 
 GAMMA = 0.8
 
-# The next value in a target: that of the best action; that of the learner's next action; or the
-# state's under the learner's policy, for learners without action values.
-Target = Literal["maximises", "follows", "states"]
-KINDS: Mapping[str, Target] = {
-    "q_learning": "maximises",
-    "off_policy_monte_carlo": "maximises",
-    "sarsa": "follows",
-    "expected_sarsa": "follows",
-    "actor_critic": "states",
-    "policy_gradient": "states",
-}
 Spaces = tuple[Observations | None, Actions | None]
 
 # Settings of all audits, unless others are given: full exploration, and targets of one step.
@@ -131,12 +122,6 @@ class Subject(ABC):
     def start(self, world: World, seed: int, changes: Mapping[str, Any]) -> Trained:
         """A learner with some settings changed, before its training."""
 
-    def begin(self, world: World, seed: int, steps: int, changes: Mapping[str, Any]) -> Trained:
-        """Train for that many steps with some settings changed."""
-        trained = self.start(world, seed, changes)
-        trained.train(steps)
-        return trained
-
     def named(self, setting: str) -> str | None:
         """The learner's name for this setting; None where it has no such setting."""
         names = OTHER_NAMES.get(setting, (setting,))
@@ -158,19 +143,19 @@ class Subject(ABC):
 
     def find_spaces(self, wanted: Spaces) -> None:
         """Take the first kinds of observations and actions that the learner can train on."""
-        errors = []
-        for observations in ("discrete", "box") if wanted[0] is None else (wanted[0],):
-            for actions in ("discrete", "box") if wanted[1] is None else (wanted[1],):
-                self.spaces = observations, actions
-                try:
-                    trained = self.begin(World(((0, 0), (1, 1))), 0, 40, {})
-                    trained.act(0)
-                    self.has_values = trained.values() is not None
-                    return
-                except UserError:
-                    raise
-                except Exception as error:  # noqa: BLE001 (user code may raise anything)
-                    errors.append(error)
+        errors: list[Exception] = []
+        known: Any = ("discrete", "box")
+        for self.spaces in product(*(known if one is None else (one,) for one in wanted)):
+            try:
+                trained = self.start(World(((0, 0), (1, 1))), 0, {})
+                trained.train(40)
+                trained.act(0)
+                self.has_values = trained.values() is not None
+                return
+            except UserError:
+                raise
+            except Exception as error:  # noqa: BLE001 (user code may raise anything)
+                errors.append(error)
         raise UserError(
             f"{self.name} cannot train on a tiny world: {type(errors[0]).__name__}: "
             f"{one_line(errors[0])} (--observations and --actions set the kinds of its spaces)"
@@ -271,7 +256,8 @@ class ClassSubject(Subject):
         self._find_family()
         if "=interpreted" in known.get("engine", []) and "engine" not in typed:
             self.stepwise = {"engine": "interpreted"}
-        spec = TrainSpec(algo=name, env_id="", algorithm=check_arguments(name, typed))
+        arguments = check_arguments(name, typed)
+        spec = validated({"algo": name, "env_id": "", "algorithm": arguments})
         self.typed = constructor_arguments(spec, self.cls, is_dict=False)
         self.find_spaces(wanted)
 
@@ -359,7 +345,8 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     policy, batch = model.policy, np.stack(observations)
     for holder in (policy, model):
         if isinstance(table := getattr(holder, "q_table", None), np.ndarray) and batch.ndim == 1:
-            return np.asarray(table, dtype=np.float64)[batch]
+            values: Floats = np.asarray(table, dtype=np.float64)[batch]
+            return values
     if isinstance(model, TileAlgorithm):
         found = own_values(model, batch)
         return None if found is None else found.reshape(len(batch), -1)
@@ -503,8 +490,9 @@ class Lab:
 
     def begin(self, world: World, steps: int | None = None, **changes: Any) -> Trained:
         """Train for some steps."""
-        steps = self.subject.steps if steps is None else steps
-        return self.subject.begin(world, self.seed, steps, changes)
+        trained = self.subject.start(world, self.seed, changes)
+        trained.train(self.subject.steps if steps is None else steps)
+        return trained
 
     def settled(self, world: World, **changes: Any) -> Floats:
         """The values of all states, shape (S,), once they no longer change.

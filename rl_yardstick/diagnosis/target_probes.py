@@ -16,16 +16,8 @@ from rl_yardstick.diagnosis.faults import UNEXPLAINED, Finding, checked
 from rl_yardstick.diagnosis.probe_worlds import (
     ARM_0,
     CHAIN,
-    DEAR_FORK,
-    END_PAYS_MORE,
-    LONG_LOOP,
-    LOOP,
-    LOOP_START_PAYS,
     N_ACTIONS,
     SAFE_FORK,
-    SEES_START,
-    STAIRS,
-    START_PAYS,
     Record,
     World,
 )
@@ -38,6 +30,13 @@ from rl_yardstick.diagnosis.subjects import (
     TrainedModel,
 )
 from rl_yardstick.mdp.transition_model import Floats
+
+SEES_START = replace(CHAIN, end_shows=0)
+START_PAYS = World(((5, 5), (1, 1)))
+END_PAYS_MORE = World(((0, 0), (2, 2)))
+LOOP = replace(CHAIN, ends=False, cut=4)
+DEAR_FORK = World(((0, 0), (1, -4)))
+STAIRS = World(((0.5, 0.5), (0, 0), (1, 1), (0, 0), (1, 1)))
 
 
 def probe_ends(lab: Lab) -> Finding:
@@ -83,13 +82,13 @@ def probe_discount(lab: Lab) -> Finding:
 
 def probe_cuts(lab: Lab) -> Finding:
     """Neither a time limit nor the start of the next episode changes a value."""
-    cut, paid = lab.settled(LOOP), lab.settled(LOOP_START_PAYS)
+    cut, paid = lab.settled(LOOP), lab.settled(replace(LOOP, pays=START_PAYS.pays))
     text = f"a state that pays 1 for ever is worth {cut[1]:.2f}"
     right = f"{1 / (1 - GAMMA):g} in both"
     if abs(paid[1] - cut[1]) > 1:
         text += f", and {paid[1]:.2f} where the first step of an episode pays 5"
         return Finding("fault", text, "reset-observation", right)
-    long = lab.settled(LONG_LOOP)
+    long = lab.settled(replace(LOOP, cut=40))
     text += f" under a limit of 4 steps, and {long[1]:.2f} under one of 40"
     if long[1] - cut[1] > 0.8:
         return Finding("fault", text, "no-bootstrap-at-truncation", right)

@@ -52,7 +52,8 @@ class ClusterWorkers(Workers):
     def __init__(self, where: str, n_jobs: int, root: Path, timeout: float | None = None) -> None:
         super().__init__(max(n_jobs, 1), timeout)
         self.where, self.n_jobs, self.root = where, n_jobs, root.absolute()
-        self.words, self._cluster = f"on the cluster {where}", None
+        self.words = f"on the cluster {where}"
+        self._cluster: Any = None
         if n_jobs and not where.endswith((".yml", ".yaml")):
             raise UserError("--jobs is for this machine or a queue of jobs: leave it out")
 
@@ -121,6 +122,7 @@ def _job_queue(path: Path, n_jobs: int) -> Any:
     if n_jobs < 1:
         raise UserError(f"{path}: say how many runs to do at once: --jobs N")
     settings = {str(name).replace("_", "-"): value for name, value in given.items()}
+    settings["processes"] = settings.get("cores")  # one run in each
     # The library's own defaults for what the file leaves out.
     dask.config.set({f"jobqueue.{system}": {**dask.config.get(f"jobqueue.{system}"), **settings}})
     cluster = getattr(dask_jobqueue, QUEUES[system])()

@@ -59,7 +59,8 @@ def arm_means(contexts: Ints, arms: Ints, rewards: Floats, shape: tuple[int, int
     overall, by_arm = np.full(shape[1], rewards.mean()), counts.sum(axis=0)
     np.divide(sums.sum(axis=0), by_arm, out=overall, where=by_arm > 0)
     means = np.tile(overall, (shape[0], 1))
-    return np.divide(sums, counts, out=means, where=counts > 0)
+    np.divide(sums, counts, out=means, where=counts > 0)
+    return means
 
 
 def arm_regressions(

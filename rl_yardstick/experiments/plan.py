@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import product
@@ -136,12 +136,8 @@ def plan(
     Args:
         study: the study.
         root: its folder.
-        counts: by labels of agent and environment, the number of seeds; by default all
-            seeds.
+        counts: by labels of agent and environment, the number of seeds; by default all.
         specs: by these labels, what is trained; by default from the study, see `specs_of`.
-
-    Raises:
-        UserError: if an agent's settings are invalid, or it does not fit an environment.
     """
     specs = specs or specs_of(study)
     folders = {environment.label: environment.folder for environment in study.environments}
@@ -183,20 +179,13 @@ def specs_of(study: StudySpec) -> dict[Labels, TrainSpec]:
     specs = {}
     for environment, agent in product(study.environments, study.agents):
         check_env_id(environment.env_id)
-        with _naming_the_place(agent, environment):
+        try:
             specs[agent.label, environment.label] = spec = _train_spec(study, agent, environment)
             check_fit(spec)
+        except UserError as error:
+            place = f"{agent.where}: " if agent.where else ""
+            raise UserError(f"{place}{agent.label} on {environment.label}: {error}") from error
     return specs
-
-
-@contextmanager
-def _naming_the_place(agent: AgentSpec, environment: EnvironmentSpec) -> Iterator[None]:
-    """Begin errors with the agent and its place in the study file."""
-    try:
-        yield
-    except UserError as error:
-        place = f"{agent.where}: " if agent.where else ""
-        raise UserError(f"{place}{agent.label} on {environment.label}: {error}") from error
 
 
 def _check_folders(what: str, places: Sequence[tuple[str, str]]) -> None:
@@ -328,12 +317,17 @@ class StudyRecord:
             raise UserError(f"{root} is no study: it has no {RECORD}")
         data = read_json(root / RECORD, MAX_RECORD)
         try:
+            study = _STUDY.validate_python(data["study"])
+            # A record of a stranger names no module and no place outside the folder.
+            own = {"gym_packages": [*study.gym_packages], "trained_agent": None}
+            own |= {"tensorboard_log": None, "watch_learning": None}
             specs = {
-                (str(one["agent"]), str(one["environment"])): TrainSpec.model_validate(one["spec"])
+                (str(one["agent"]), str(one["environment"])): TrainSpec.model_validate(
+                    {**one["spec"], **own}
+                )
                 for one in data["specs"]
             }
-            looks = tuple(map(int, data["looks"]))
-            return cls(_STUDY.validate_python(data["study"]), specs, looks)
+            return cls(study, specs, tuple(map(int, data["looks"])))
         except (ValidationError, LookupError, TypeError, ValueError) as error:
             raise UserError(f"{root / RECORD} is no study of this version") from error
 

@@ -340,8 +340,7 @@ def find_study(given: str) -> Path:
     """Find a study file: the given path, or else the shipped study of that name.
 
     Args:
-        given: a path, or for a shipped study also its bare name: ``mine-maze``,
-            ``mine-maze.yml`` or ``studies/mine-maze.yml``.
+        given: a path; for a shipped study also ``mine-maze`` or ``studies/mine-maze.yml``.
 
     Raises:
         UserError: if it is a plain name, and neither exists.

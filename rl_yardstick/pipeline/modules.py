@@ -45,7 +45,9 @@ def _import_file(path: Path) -> None:
         raise UserError(f"--gym-packages {path}: no such file")
     package = path.parent if path.name == "__init__.py" else None
     name, folder = (package.name, package.parent) if package else (path.stem, path.parent)
-    if name in sys.modules:
+    if (loaded := sys.modules.get(name)) is not None:
+        if Path(getattr(loaded, "__file__", None) or "").resolve() != path.resolve():
+            raise UserError(f"--gym-packages {path}: another module is named {name}; rename it")
         return
     sys.path.insert(0, str(folder.resolve()))  # what lies beside it can be imported too
     importlib.import_module(name)

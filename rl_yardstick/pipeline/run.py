@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import re
@@ -153,7 +154,8 @@ class Run:
         import yaml
 
         def text(data: Mapping[str, Any]) -> str:
-            return str(yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
+            plain = json.loads(json.dumps(data, default=str))  # no paths
+            return str(yaml.dump(plain, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
 
         settings = self.settings_path(spec)
         settings.mkdir(exist_ok=True)

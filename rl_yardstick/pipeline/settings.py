@@ -197,8 +197,8 @@ def literal(text: str) -> Any:
         return _literal(ast.parse(text.strip(), mode="eval").body)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         pass
-    # YAML has more literals, such as [SFFF, FFFG] and false.
-    if text.strip().startswith(("[", "{")) or text in ("true", "false", "null"):
+    # YAML has more literals, such as {a: 1}.
+    if text.strip().startswith(("[", "{")):
         try:
             return parse_yaml(text, text)
         except UserError:
@@ -206,10 +206,15 @@ def literal(text: str) -> Any:
     return text
 
 
+_YAML_WORDS = {"true": True, "false": False, "null": None}
+
+
 def _literal(node: ast.expr) -> Any:
     if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "dict" and not node.args:
         return {str(word.arg): _literal(word.value) for word in node.keywords}
-    if isinstance(node, ast.Attribute):  # nn.ReLU: looked up when it is needed
+    if isinstance(node, ast.Name) and node.id in _YAML_WORDS:
+        return _YAML_WORDS[node.id]
+    if isinstance(node, ast.Attribute | ast.Name):  # nn.ReLU: looked up when it is needed
         return ast.unparse(node)
     if isinstance(node, ast.List | ast.Tuple):
         return [_literal(item) for item in node.elts]

@@ -68,10 +68,8 @@ _SIGNS = {
     "…": r"\ldots{}",
     "†": r"$\dagger$",
 }
-_GREEK = (
-    "ALPHA BETA GAMMA DELTA EPSILON ZETA ETA THETA KAPPA LAMDA MU NU XI PI RHO SIGMA TAU PHI CHI "
-    "PSI OMEGA"
-)
+_GREEK = "ALPHA BETA GAMMA DELTA EPSILON ZETA ETA THETA KAPPA LAMDA MU NU XI PI RHO SIGMA TAU PHI "
+_GREEK += "CHI PSI OMEGA"
 _NOT_IN_OT1 = "ÐÞðþ«»"  # Latin-1 characters that pdfLaTeX prints in other font encodings only
 _BEFORE_A_NUMBER = re.compile(r"(?<![\w.)\]}-])-(?=[\d.∞])")
 # LaTeX joins two hyphens, commas or apostrophes into one character. At the start of a row or an
@@ -121,8 +119,6 @@ def _templates(markup: Markup) -> Environment:
     return environment
 
 
-# A study as Markdown or LaTeX: verdicts, failures and cost.
-
 NOTHING = "-"
 
 
@@ -161,12 +157,8 @@ def verdicts_as(markup: Markup, analysis: StudyAnalysis, command: str) -> str:
         unseen=words.unseen_sentence(analysis),
         headline=headline(analysis),
         environments=[
-            {
-                "name": environment.environment,
-                "ranking": ranking(analysis.results, environment),
-                "sentences": words.conclusion(study, environment).everything,
-            }
-            for environment in analysis.environments
+            (one.environment, ranking(analysis.results, one), words.conclusion(study, one))
+            for one in analysis.environments
         ],
     )
     if markup == "md":
@@ -197,10 +189,8 @@ def _legend(analysis: StudyAnalysis) -> str:
     study, environments = analysis.study, analysis.environments
     what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
     if all(one.is_score for one in environments):
-        what = (
-            "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts "
-            "as 0."
-        )
+        what = "Mean score: 1 is the optimum, 0 the best random or constant policy, and less "
+        what += "counts as 0."
         names = [one.environment for one in environments if one.optimum_at_least is not None]
         if names:
             what += f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
@@ -240,12 +230,11 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
 
     A column in which no agent has a figure is left out.
     """
-    costs = processor_seconds(results)
-    found: list[dict[str, str]] = []
+    costs, found = processor_seconds(results), {}
     for agent in environment.agents:
         runs, stays = agent.runs, agent.steps_to_stay
         cost = costs.get((agent.agent, environment.environment))
-        figures = {
+        found[agent.agent, bool(agent.changes)] = {
             "mean": interval(agent.metric.mean),
             "median": number(agent.metric.median.point),
             "score": NOTHING if agent.score is None else interval(agent.score, score_number),
@@ -253,12 +242,9 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
             "stays from": NOTHING if stays is None else number(stays.median.point),
             "processor time": NOTHING if cost is None else duration(cost),
         }
-        found.append(figures)
-    kept = [name for name in found[0] if any(figures[name] != NOTHING for figures in found)]
-    rows = [
-        Row(agent.agent, bool(agent.changes), [Cell(figures[name]) for name in kept])
-        for agent, figures in zip(environment.agents, found, strict=True)
-    ]
+    table = pd.DataFrame.from_dict(found, orient="index")
+    kept = table.loc[:, (table != NOTHING).any()]
+    rows = [Row(*of, list(map(Cell, cells))) for of, cells in zip(found, kept.values, strict=True)]
     metric = METRIC_WORDS[results.study.metric]
     caption = f"{environment.environment}: {metric}, with 95 % intervals over seeds."
     return Table(["", *kept], rows, caption)

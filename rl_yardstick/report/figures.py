@@ -25,7 +25,7 @@ from matplotlib.ticker import (
 )
 from matplotlib.transforms import offset_copy
 
-from rl_yardstick.experiments.analysis import EnvironmentAnalysis, OverallAnalysis
+from rl_yardstick.experiments.analysis import EnvironmentAnalysis
 from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, file_name
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.curve_pictures import DWARFED, symlog_ticks
@@ -34,7 +34,6 @@ from rl_yardstick.report.series import (
     COLOURS,
     DASHES,
     SPREAD,
-    AgentRuns,
     ArmSeries,
     Belief,
     Curve,
@@ -45,7 +44,6 @@ from rl_yardstick.report.series import (
     Mark,
     PullSeries,
     StudySeries,
-    Sweep,
     linear_up_to,
     mean_regret,
     regret_of_runs,
@@ -85,6 +83,7 @@ _FONTS: Any = {
     "pdf.fonttype": 42,  # TrueType, which publishers ask for
 }
 FORMATS = ("png", "svg", "pdf")
+_UNDATED = {"svg": {"metadata": {"Date": None}}, "pdf": {"metadata": {"CreationDate": None}}}
 
 LOG = "(log scale)"
 
@@ -115,7 +114,7 @@ class FigureFiles:
     """Saves figures as files."""
 
     folder: Path  # of the files
-    formats: Sequence[str] = FORMATS[:2]  # among "png", "svg", "pdf"
+    formats: Sequence[str]  # among "png", "svg", "pdf"
     written: list[Path] = field(default_factory=list)  # the files so far
 
     @contextmanager
@@ -133,17 +132,13 @@ class FigureFiles:
             yield axes
             for form in sorted(set(self.formats), key=FORMATS.index):
                 self.written.append(self.folder / f"{name}.{form}")
+                backend = f"matplotlib.backends.backend_{'agg' if form == 'png' else form}"
+                # By its backend: `savefig` would draw twice, first for the layout.
+                draw_on = import_module(backend).FigureCanvas(canvas)
                 with replacing(self.written[-1]) as beside:
-                    write(canvas, form, beside)
+                    getattr(draw_on, f"print_{form}")(beside, **_UNDATED.get(form, {}))
                 # The other formats keep the layout of the first: computing it takes longest.
                 canvas.set_layout_engine("none")
-
-
-def write(canvas: Figure, form: str, path: Path) -> None:
-    """Write a figure by its backend; `savefig` would draw twice, first for the layout."""
-    backend = import_module(f"matplotlib.backends.backend_{'agg' if form == 'png' else form}")
-    undated = {"svg": {"metadata": {"Date": None}}, "pdf": {"metadata": {"CreationDate": None}}}
-    getattr(backend.FigureCanvas(canvas), f"print_{form}")(path, **undated.get(form, {}))
 
 
 def width_of(text: str, size: float = _SMALL) -> float:
@@ -295,9 +290,19 @@ def _draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
     label_ends(axes, [(name, x[-1], y[-1], style["color"]) for name, x, y, style in lines])
 
 
-def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> None:
-    """Cumulative regret on a logarithmic axis of pulls, with the bounds from theory."""
-    axes.set_xscale("log")
+def draw_regret(places: Sequence[Axes], series: PullSeries, place: str, marks: Marks) -> None:
+    """Cumulative regret on a logarithmic axis of pulls, with the bounds from theory.
+
+    On the second axes, if there are any, simple regret: the best mean reward less that of the arm
+    pulled most so far.
+    """
+    axes, *others = places
+    for each in places:
+        each.set_xscale("log")
+    for each in others:
+        _draw_lines(each, _by_pull(series, "simple_regret", marks))
+        title = "of recommending the arm pulled most"
+        lettering(each, title=title, x=_PULLS, y="simple regret")
     lines = _by_pull(series, "cumulative_regret", marks)
     # The interval of the mean and the spread of runs, or fewer bands where agents are many.
     kinds = ((mean_regret, 0.3), (regret_of_runs, 0.08))[: MOST_BANDS // len(series.pulls)]
@@ -319,14 +324,6 @@ def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> Non
     axes.set_ylim(0, 1.05 * highest)
     _draw_lines(axes, lines)
     lettering(axes, title=title, x=_PULLS, y="cumulative regret")
-
-
-def draw_simple_regret(axes: Axes, series: PullSeries, marks: Marks) -> None:
-    """Simple regret: the best mean reward less that of the arm pulled most so far."""
-    axes.set_xscale("log")
-    _draw_lines(axes, _by_pull(series, "simple_regret", marks))
-    title = "of recommending the arm pulled most"
-    lettering(axes, title=title, x=_PULLS, y="simple regret")
 
 
 def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
@@ -380,6 +377,7 @@ CIRCLES_APART = 0.12  # of the diagonal of the axes
 NAMES = 2.1  # inches, the width of the names of agents beside their runs
 LONGEST = 20  # letters of a value on an axis
 MOST_TICKS = 8  # the largest number of values of a parameter with a tick each
+_BETWEEN = "; the optimum lies between the lines"
 FEW = 3  # the largest number of names in a legend's entry
 BLOCKS = {"average": "-", "minimum": ":", "maximum": "--"}
 
@@ -390,13 +388,10 @@ def panels(curves: Mapping[str, LearningCurves]) -> list[tuple[str, str]]:
     return [(kind, by) for kind, by in both if curves[kind].by_axis[by]]
 
 
-def draw_learning_curves(
-    places: Sequence[Axes],
-    curves: Mapping[str, LearningCurves],
-    environment: EnvironmentAnalysis,
-    marks: Marks,
-) -> None:
+def draw_learning_curves(places: Sequence[Axes], one: EnvironmentSeries, marks: Marks) -> None:
     """Draw each of the `panels` on its axes, with intervals for the first (best) agents."""
+    assert one.curves is not None
+    curves, environment = one.curves, one.environment
     kinds, on_variant = panels(curves), curves["training"].on_variant
     scales = {kind: curves[kind].linear_up_to for kind, _ in kinds}
     # Returns on a variant are another metric, with an axis of its own.
@@ -466,14 +461,9 @@ def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
             axes.axhline(height, color=REFERENCE, ls=style, lw=1, label=label, zorder=1)
 
 
-def draw_runs(
-    axes: Axes,
-    runs: Sequence[AgentRuns],
-    environment: EnvironmentAnalysis,
-    metric: str,
-    marks: Marks,
-) -> None:
+def draw_runs(axes: Axes, one: EnvironmentSeries, metric: str, marks: Marks) -> None:
     """Each run as a dot, the mean with its interval; the best agent on top."""
+    runs, environment = one.runs, one.environment
     upwards = runs[::-1]
     for row, agent in enumerate(upwards):
         colour, mean, n = COLOURS[marks[agent.agent].colour], agent.mean, len(agent.values)
@@ -493,11 +483,7 @@ def draw_runs(
         for end in (environment.optimum, at_least):
             if end is not None:
                 axes.axvline(end, color=REFERENCE, linewidth=1)
-        title += (
-            "; the line is the optimum"
-            if at_least is None
-            else "; the optimum lies between the lines"
-        )
+        title += "; the line is the optimum" if at_least is None else _BETWEEN
         title += "" if environment.optimum_is_proven else " (the upper one is not proven)"
     ends = "range" if all(a.mean.is_range for a in runs) else "95 % interval"
     x = f"{METRIC_WORDS[metric]}; mean, {ends}, each seed"
@@ -507,10 +493,9 @@ def draw_runs(
     lettering(axes, title=title, x=x, beside=widest + 0.3)
 
 
-def draw_sweeps(
-    axes: Axes, sweeps: Mapping[str, Sweep], environment: EnvironmentAnalysis, metric: str
-) -> None:
+def draw_sweeps(axes: Axes, one: EnvironmentSeries, metric: str) -> None:
     """The metric by the swept parameter, for agents swept over one parameter."""
+    sweeps, environment = one.sweeps, one.environment
     names = list(dict.fromkeys(sweep.parameter for sweep in sweeps.values()))
     values = np.unique(np.concatenate([sweep.means.x for sweep in sweeps.values()]))
     words = _set_scale_of_values(axes, values)
@@ -603,20 +588,6 @@ def _brief(text: str) -> str:
     return wrapped(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…", 1.0)
 
 
-def draw_profiles(axes: Axes, overall: OverallAnalysis, marks: Marks) -> None:
-    """The share of runs whose score is higher than each threshold."""
-    for agent, shares in overall.profiles.items():
-        style = line_style(marks[agent])
-        axes.plot(overall.thresholds, shares, label=agent, linewidth=1.5, **style)
-    axes.set_ylim(0, 1.02)
-    axes.yaxis.set_major_formatter(PercentFormatter(1))
-    title = "Performance profiles over environments"
-    lettering(axes, title=title, x="score", y="share of runs with a higher score")
-    shared_legend(axes)
-
-
-# Which figures a study has, and their files.
-
 # The lines of more agents are unreadable; a sweep shows its agents by parameter instead.
 MOST_LINES = 14
 MOST_IN_PAIRS = 8  # the largest number of panels in two columns; more are in three
@@ -634,9 +605,16 @@ def write_figures(series: StudySeries, episodes_table: pd.DataFrame | None) -> l
             _bandit_figures(files, one.pulls, one.environment.environment, series.marks)
     for one in series.environments:
         _study_figures(files, series, one, episodes_table)
-    if series.analysis.overall is not None:
+    if (overall := series.analysis.overall) is not None:
         with files.figure("performance_profiles") as (axes,):
-            draw_profiles(axes, series.analysis.overall, series.marks)
+            for agent, shares in overall.profiles.items():
+                style = line_style(series.marks[agent])
+                axes.plot(overall.thresholds, shares, label=agent, linewidth=1.5, **style)
+            axes.set_ylim(0, 1.02)
+            axes.yaxis.set_major_formatter(PercentFormatter(1))
+            title = "Performance profiles over environments"
+            lettering(axes, title=title, x="score", y="share of runs with a higher score")
+            shared_legend(axes)
     return files.written
 
 
@@ -647,7 +625,7 @@ def _study_figures(
     name = file_name(environment.environment)
     if one.sweeps:
         with files.figure(f"{name}_sweep") as (axes,):
-            draw_sweeps(axes, one.sweeps, environment, metric)
+            draw_sweeps(axes, one, metric)
     for group, grid in one.grids.items():
         title = environment.environment + (f", {group}" if len(one.grids) > 1 else "")
         height = 1.6 + 0.4 * len(grid.down)
@@ -657,9 +635,9 @@ def _study_figures(
         return
     if n_columns := len(panels(one.curves)):
         with files.figure(f"{name}_learning_curves", n_columns) as places:
-            draw_learning_curves(places, one.curves, environment, marks)
+            draw_learning_curves(places, one, marks)
     with files.figure(f"{name}_intervals") as (axes,):
-        draw_runs(axes, one.runs, environment, metric, marks)
+        draw_runs(axes, one, metric, marks)
     if blocks is not None:
         rows = blocks[blocks["environment"] == environment.environment]
         _block_figure(files, f"{name}_episodes", rows, marks)
@@ -693,10 +671,8 @@ def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Ma
         with files.figure(f"{name}_pulls", n_rows=2) as (upper, lower):
             draw_rewards(upper, lower, pulls, place, marks)
         has_simple = any(np.isfinite(p.simple_regret).any() for p in pulls.pulls.values())
-        with files.figure(f"{name}_regret", n_rows=1 + has_simple) as (upper, *others):
-            draw_regret(upper, pulls, place, marks)
-            for axes in others:
-                draw_simple_regret(axes, pulls, marks)
+        with files.figure(f"{name}_regret", n_rows=1 + has_simple) as places:
+            draw_regret(places, pulls, place, marks)
     if pulls.arms is not None and len(pulls.arms.shares) <= MOST_LINES:
         with files.figure(f"{name}_arms", n_rows=2) as (upper, lower):
             draw_arms(upper, lower, pulls.arms, marks)

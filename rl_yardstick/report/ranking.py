@@ -80,12 +80,9 @@ class Column:
     cell: Callable[[Row], Cell | None]  # its cell in a row; None if it does not apply
     page: str = ""  # its heading on the page
     help: str = ""  # small print below that heading; ``{threshold}`` is the environment's
-    terminal: str = ""  # its heading in the terminal
-    # Its explanation below the table in the terminal, also with ``{threshold}``; ``{variants}``
-    # explains the mark of agents that were trained on a variant of the environment.
-    caption: str = ""
     # The order that puts the best first; None for that of the study's metric.
     best_first: Order | None = None
+    terminal: str = ""  # its heading in the terminal
 
     def order(self, study: StudySpec) -> Order:
         """The order that puts the best first in a study."""
@@ -97,6 +94,10 @@ def filled(columns: Sequence[Column], rows: Sequence[Row]) -> list[tuple[Column,
     found = [(column, [column.cell(row) for row in rows]) for column in columns]
     dash = Cell("-", None)
     return [(column, [cell or dash for cell in cells]) for column, cells in found if any(cells)]
+
+
+def _median(row: Row) -> Cell:
+    return estimate_cell(row.agent.metric.median)
 
 
 def _score(row: Row) -> Cell | None:
@@ -179,39 +180,26 @@ def _by_pulls(cell: Callable[[PullStatistics], Cell]) -> Callable[[Row], Cell | 
 
 # A new statistic is one more entry.
 COLUMNS = (
-    Column(lambda row: estimate_cell(row.agent.metric.mean), "Mean", "over seeds", "mean"),
+    Column(lambda row: estimate_cell(row.agent.metric.mean), "Mean", "over seeds", None, "mean"),
     Column(lambda row: number_cell(row.agent.metric.iqm), "IQM", "middle half"),
-    Column(lambda row: estimate_cell(row.agent.metric.median), "Median", "over seeds", "median"),
-    Column(_score, "Score", "1 is optimal", "score", best_first="descending"),
-    Column(
-        _failed,
-        "Failed",
-        "runs below {failed}",
-        "failed",
-        caption="runs with a score below {failed}, half the best median",
-        best_first="ascending",
-    ),
-    Column(_gap, "Gap", "to the optimum", best_first="ascending"),
-    Column(
-        _training,
-        terminal="training",
-        caption="return of the last 100 training episodes{variants}",
-    ),
-    Column(_success, "Success", "in the end", best_first="descending"),
-    Column(
-        _stays_from,
-        "Stays from",
-        "step, at {threshold}",
-        "stays from",
-        caption="median step from which the return stays above {threshold}",
-        best_first="ascending",
-    ),
-    Column(_episodes, "Episodes", "to stay at {threshold}", best_first="ascending"),
-    Column(_seconds, "CPU time", "seconds of training", "CPU time", best_first="ascending"),
-    Column(_runs, "Runs", "finished", best_first="descending"),
+    Column(_median, "Median", "over seeds", None, "median"),
+    Column(_score, "Score", "1 is optimal", "descending", "score"),
+    Column(_failed, "Failed", "runs below {failed}", "ascending", "failed"),
+    Column(_gap, "Gap", "to the optimum", "ascending"),
+    Column(_training, terminal="training"),
+    Column(_success, "Success", "in the end", "descending"),
+    Column(_stays_from, "Stays from", "step, at {threshold}", "ascending", "stays from"),
+    Column(_episodes, "Episodes", "to stay at {threshold}", "ascending"),
+    Column(_seconds, "CPU time", "seconds of training", "ascending", "CPU time"),
+    Column(_runs, "Runs", "finished", "descending"),
 )
-
-# On the page, folded below the ranking.
+# What the terminal says of columns below the table; ``{variants}`` explains the mark of agents
+# that were trained on a variant of the environment.
+CAPTIONS = {
+    "failed": "runs with a score below {failed}, half the best median",
+    "training": "return of the last 100 training episodes{variants}",
+    "stays from": "median step from which the return stays above {threshold}",
+}
 
 
 def _other_return(returns: Estimate | None, words: str) -> Cell:
@@ -219,6 +207,14 @@ def _other_return(returns: Estimate | None, words: str) -> Cell:
         return Cell("unknown", None)
     cell = estimate_cell(returns)
     return replace(cell, note="; ".join(filter(None, (cell.note, words))))
+
+
+def _greedy(row: Row) -> Cell:
+    return estimate_cell(row.agent.final)
+
+
+def _stochastic(row: Row) -> Cell:
+    return _other_return(row.agent.stochastic, row.agent.acts_by)
 
 
 def _discounted(row: Row) -> Cell | None:
@@ -229,20 +225,11 @@ def _discounted(row: Row) -> Cell | None:
     return _other_return(row.agent.discounted, words)
 
 
+# On the page, folded below the ranking.
 OTHER_RETURNS = (
-    Column(
-        lambda row: estimate_cell(row.agent.final),
-        "Greedy",
-        "the final policy's return",
-        best_first="descending",
-    ),
-    Column(
-        lambda row: _other_return(row.agent.stochastic, row.agent.acts_by),
-        "Stochastic",
-        "as it acts in training",
-        best_first="descending",
-    ),
-    Column(_discounted, "Discounted", "greedy, under its own discount", best_first="descending"),
+    Column(_greedy, "Greedy", "the final policy's return", "descending"),
+    Column(_stochastic, "Stochastic", "as it acts in training", "descending"),
+    Column(_discounted, "Discounted", "greedy, under its own discount", "descending"),
 )
 
 # In the terminal, bandits have a table of their own; on the page, a section.
@@ -252,8 +239,7 @@ BANDIT_COLUMNS = (
     Column(_by_pulls(lambda p: number_cell(p.simple_regret[-1])), terminal="simple regret"),
     Column(_by_pulls(lambda p: number_cell(p.reward[-1])), terminal="reward"),
     Column(
-        _by_pulls(lambda p: Cell(f"{p.optimal[-1]:.1%}", float(p.optimal[-1]))),
-        terminal="best arm",
+        _by_pulls(lambda p: Cell(f"{p.optimal[-1]:.1%}", float(p.optimal[-1]))), terminal="best arm"
     ),
     Column(_seconds, terminal="CPU time"),
 )

@@ -91,19 +91,17 @@ class LearningCurves:
     budget: str = "step"
 
 
-def learning_curves(
-    results: StudyResults, environment: EnvironmentAnalysis
-) -> dict[str, LearningCurves]:
+def learning_curves(results: StudyResults, one: EnvironmentAnalysis) -> dict[str, LearningCurves]:
     """The curves on an environment, by kind; none where each would be a single point."""
-    here = [run.spec for run in results.planned if run.environment == environment.environment]
+    here = [run.spec for run in results.planned if run.environment == one.environment]
     by_episode = here and all(spec.n_timesteps is None for spec in here)
-    agents = [agent.agent for agent in environment.agents]
-    variants = tuple(agent.agent for agent in environment.agents if agent.on_variant)
-    runs = curves_by_agent(results, environment.environment)
+    agents = [agent.agent for agent in one.agents]
+    variants = tuple(agent.agent for agent in one.agents if agent.on_variant)
+    runs = curves_by_agent(results, one.environment)
     found = {}
     for kind in KINDS:
         # Training returns of a changed environment have other bounds.
-        bounds = UNBOUNDED if kind == "training" and variants else environment.bounds
+        bounds = UNBOUNDED if kind == "training" and variants else one.bounds
         by_axis: dict[str, dict[str, Curve]] = {by: {} for by in AXES}
         for by, agent in product(AXES, agents):
             if (curve := mean_of(runs.get((agent, kind), []), by, bounds)) is not None:
@@ -111,7 +109,7 @@ def learning_curves(
         for by, curves in by_axis.items():
             if all(len(curve.x) == 1 for curve in curves.values()):
                 by_axis[by] = {}
-        scale = linear_up_to([curve.y for curve in by_axis["step"].values()], environment.optimum)
+        scale = linear_up_to([curve.y for curve in by_axis["step"].values()], one.optimum)
         budget = "episode" if by_episode and by_axis["episode"] else "step"
         on_variant = variants if kind == "training" else ()
         found[kind] = LearningCurves(by_axis, scale, on_variant, budget)
@@ -228,9 +226,8 @@ def lai_robbins_slope(means: ArrayLike) -> float:
 
 def best_of_normals(n: int) -> float:
     """The expected maximum of ``n`` independent standard normal variables."""
-    value, _ = integrate.quad(
-        lambda x: x * n * stats.norm.pdf(x) * stats.norm.cdf(x) ** (n - 1), -np.inf, np.inf
-    )
+    cdf, pdf = stats.norm.cdf, stats.norm.pdf
+    value, _ = integrate.quad(lambda x: x * n * pdf(x) * cdf(x) ** (n - 1), -np.inf, np.inf)
     return float(value)
 
 

@@ -16,7 +16,7 @@ from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.off_policy import difference_in_value, mean_reward
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.study import METRIC_WORDS, StudySpec
-from rl_yardstick.report.ranking import BANDIT_COLUMNS, COLUMNS, Column, Row, filled
+from rl_yardstick.report.ranking import BANDIT_COLUMNS, CAPTIONS, COLUMNS, Column, Row, filled
 from rl_yardstick.report.words import (
     conclusion,
     enumeration,
@@ -25,7 +25,7 @@ from rl_yardstick.report.words import (
     overall_sentences,
     pairs_both_ways,
     seed_sentence,
-    seeds_of,
+    seeds,
     unseen_sentence,
 )
 from rl_yardstick.verdicts import FEW, Estimate
@@ -80,25 +80,27 @@ def _words_of_pairs(environment: EnvironmentAnalysis) -> Table:
     return table
 
 
-def _print_ranking(
-    console: Console, analysis: StudyAnalysis, environment: EnvironmentAnalysis
-) -> None:
-    pulls, label = analysis.results.pulls, environment.environment
-    rows = [
-        Row(agent, environment, pulls.get((agent.agent, label))) for agent in environment.agents
-    ]
+def _print_ranking(console: Console, analysis: StudyAnalysis, one: EnvironmentAnalysis) -> None:
+    pulls, label = analysis.results.pulls, one.environment
+    agents = one.agents
+    rows = [Row(agent, one, pulls.get((agent.agent, label))) for agent in agents]
     on_bandit = [row for row in rows if row.pulls is not None]
     if on_bandit:
         left_out = _print_fitting(console, label, BANDIT_COLUMNS, on_bandit)
-        explained = _bandit_caption(analysis.study, left_out)
+        runs = f"over {analysis.study.n_seeds} runs"
+        explained = [f"regret: sum over the pulls of a run, with 95 % intervals {runs}"]
+        if "simple regret" not in left_out:
+            explained.append("simple regret: of recommending the arm pulled most")
+        if last := [name for name in ("reward", "best arm") if name not in left_out]:
+            explained.append(f"{', '.join(last)}: at the last pulls")
     else:
         title = label
-        if environment.optimum is not None:
-            title += f": optimum {optimum_words(environment)}"
-            title += f", best random or constant policy {number(environment.baseline)}"
+        if one.optimum is not None:
+            title += f": optimum {optimum_words(one)}"
+            title += f", best random or constant policy {number(one.baseline)}"
         columns = [column for column in COLUMNS if column.terminal]
         left_out = _print_fitting(console, title, columns, rows)
-        explained = _caption(analysis.study, environment, left_out)
+        explained = _caption(analysis.study, one, left_out)
     if left_out:
         explained.append(f"a wider terminal shows {enumeration(left_out)} too")
     # As wide as the terminal, and not as the table, which may be narrow.
@@ -165,35 +167,23 @@ def folded(name: str, width: int, ends: Sequence[str] = (r"[\s/,]", "[_=-]")) ->
     return "\n".join(folded(line.rstrip(), width, ends[1:]) for line in lines)
 
 
-def _caption(
-    study: StudySpec, environment: EnvironmentAnalysis, left_out: Sequence[str]
-) -> list[str]:
-    rows = [Row(agent, environment) for agent in environment.agents]
-    on_variant = any(agent.on_variant for agent in environment.agents)
+def _caption(study: StudySpec, one: EnvironmentAnalysis, left_out: Sequence[str]) -> list[str]:
+    rows = [Row(agent, one) for agent in one.agents]
+    on_variant = any(agent.on_variant for agent in one.agents)
     words = {
-        "threshold": number(environment.threshold),
-        "failed": number(environment.failure_threshold),
+        "threshold": number(one.threshold),
+        "failed": number(one.failure_threshold),
         "variants": " (*: on a variant of the environment)" if on_variant else "",
     }
-    n_runs = [agent.n_runs for agent in environment.agents]
+    over = seeds(*(one.seeds.values() or [study.n_seeds]))
+    n_runs = [agent.n_runs for agent in one.agents]
     what = "the range of the runs" if max(n_runs, default=0) < FEW else "95 % intervals"
-    told = [f"mean: {METRIC_WORDS[study.metric]} over {seeds_of(study, environment)}, with {what}"]
-    if any(agent.metric.mean.low == agent.metric.mean.high for agent in environment.agents):
+    told = [f"mean: {METRIC_WORDS[study.metric]} over {over}, with {what}"]
+    if any(agent.metric.mean.low == agent.metric.mean.high for agent in one.agents):
         told[0] += " (none where all runs are equal)"
-    for column, _ in filled(COLUMNS, rows):
-        if column.terminal and column.caption and column.terminal not in left_out:
-            told.append(f"{column.terminal}: {column.caption.format(**words)}")
-    return told
-
-
-def _bandit_caption(study: StudySpec, left_out: Sequence[str]) -> list[str]:
-    explained = [
-        f"regret: sum over the pulls of a run, with 95 % intervals over {study.n_seeds} runs"
-    ]
-    if "simple regret" not in left_out:
-        explained.append("simple regret: of recommending the arm pulled most")
-    last = [name for name in ("reward", "best arm") if name not in left_out]
-    return [*explained, f"{', '.join(last)}: at the last pulls"] if last else explained
+    shown = [column.terminal for column, _ in filled(COLUMNS, rows)]
+    known = [name for name in shown if name in CAPTIONS and name not in left_out]
+    return told + [f"{name}: {CAPTIONS[name].format(**words)}" for name in known]
 
 
 def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:
@@ -228,18 +218,11 @@ def _width(console: Console, table: Table) -> int:
     return Measurement.get(console, console.options.update(width=UNBOUNDED), table).maximum
 
 
-# ``compare.py --logged``: policies on a log as a table and in sentences.
-
 # With a smaller effective sample size, the interval of an estimate is unreliable.
 FEW_PULLS = 100
 SHORT, MOST_DECIMALS = 3, 6
 # The estimates of a policy, by heading.
-ESTIMATES = {
-    "IPS": "ips",
-    "self-normalised": "snips",
-    "direct": "direct",
-    "doubly robust": "doubly_robust",
-}
+ESTIMATES = {"IPS": "ips", "self-normalised": "snips", "doubly robust": "doubly_robust"}
 # Columns to drop, in this order, while the table is wider than the terminal.
 OFF_POLICY_LEFT_OUT = ("IPS", "self-normalised", "effective")
 

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
-from rl_yardstick.experiments.analysis import (
-    MARK,
-    ON_THE_SCALE,
-    EnvironmentAnalysis,
-    StudyAnalysis,
-)
+from rl_yardstick.experiments.analysis import MARK, ON_THE_SCALE, EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.plan import Seeds, TuningSeeds
 from rl_yardstick.experiments.study import METRIC_WORDS, OF_TRAINING, StudySpec
 from rl_yardstick.pipeline.evaluation.yardstick import bracket_mark
@@ -126,12 +121,11 @@ def _tuned(seeds: range, found: Mapping[str, Seeds], whose: str, these: str) -> 
     groups: dict[Seeds, list[str]] = {}
     for name, shared in found.items():
         groups.setdefault(shared, []).append(name)
-    told = {
-        shared: f"{spans(shared)} of these" if len(shared) < len(seeds) else these
-        for shared in groups
-        if shared
-    }
-    return [f"{whose} {_names(groups[one])} were tuned on {which}" for one, which in told.items()]
+    told = []
+    for shared, names in groups.items():
+        which = these if len(shared) == len(seeds) else f"{spans(shared)} of these"
+        told += [f"{whose} {_names(names)} were tuned on {which}"] if shared else []
+    return told
 
 
 def _names(names: Sequence[str]) -> str:
@@ -192,11 +186,6 @@ def _other(environment: EnvironmentAnalysis, pair: Pair) -> str:
     return f"{pair.second} ({'; '.join(told)})"
 
 
-def seeds_of(study: StudySpec, environment: EnvironmentAnalysis) -> str:
-    """The planned numbers of seeds of the agents, in words."""
-    return seeds(*(environment.seeds.values() or [study.n_seeds]))
-
-
 def unseen_sentence(analysis: StudyAnalysis) -> str:
     """What this many runs cannot show; once on every page."""
     counts = [agent.runs.n for one in analysis.environments for agent in one.agents]
@@ -235,8 +224,7 @@ def speed_sentences(environment: EnvironmentAnalysis) -> Iterator[str]:
     yield f"{'; '.join(parts)}."
 
 
-@dataclass(frozen=True)
-class Conclusion:
+class Conclusion(NamedTuple):
     """The sentences on an environment."""
 
     lead: str  # who is best, and the optimum
@@ -253,20 +241,17 @@ class Conclusion:
 
 def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion:
     """What a study has shown on one environment."""
-    return Conclusion(
-        lead=_lead(study, environment),
-        pairs=tuple(pair_sentences(environment)),
-        notes=(
-            *_on_failures(environment),
-            *_on_the_task(environment),
-            *speed_sentences(environment),
-            *_on_what_cannot_be_compared(study, environment),
-            *on_changes([environment]),
-            *_on_missing(study, environment),
-            *environment.advice,
-            *_on_looks(environment),
-        ),
-    )
+    notes = [
+        *_on_the_task(environment),
+        *speed_sentences(environment),
+        *_on_what_cannot_be_compared(study, environment),
+        *on_changes([environment]),
+        *_on_missing(study, environment),
+        *environment.advice,
+        *_on_looks(environment),
+    ]
+    pairs = tuple(pair_sentences(environment))
+    return Conclusion(_lead(study, environment), pairs, tuple(notes))
 
 
 def overall_sentences(analysis: StudyAnalysis) -> list[str]:
@@ -329,8 +314,8 @@ def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
     return optimum > baseline and all(median <= reach for median in medians)
 
 
-def _on_failures(environment: EnvironmentAnalysis) -> Iterator[str]:
-    """How many runs of each agent failed."""
+def _on_the_task(environment: EnvironmentAnalysis) -> Iterator[str]:
+    """Failed runs; settings that change the environment, and so the optimum; what is hidden."""
     failed = [
         f"{agent.runs.failed} of {agent.runs.n} runs of {agent.agent} failed"
         for agent in environment.agents
@@ -338,10 +323,6 @@ def _on_failures(environment: EnvironmentAnalysis) -> Iterator[str]:
     ]
     if failed:
         yield f"{enumeration(failed)}."
-
-
-def _on_the_task(environment: EnvironmentAnalysis) -> Iterator[str]:
-    """Settings that change the environment, and so the optimum; what observations hide."""
     if environment.optima:
         each = [f"{number(optimum)} for {name}" for name, optimum in environment.optima.items()]
         yield (

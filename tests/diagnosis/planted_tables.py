@@ -42,57 +42,51 @@ def one_step(
     steps: int,
     exploration_initial_eps: float = 1.0,
     exploration_final_eps: float = 0.1,
+    lam: float = 0.0,
+    learning_rate: float = 0.1,
     *,
     target: str = "max",
     fault: str = "",
 ) -> Agent:
-    """Q-learning, SARSA or Expected SARSA from single steps."""
-    env, rng = make_env(), np.random.default_rng(seed)
-    if fault == "not-reproducible":
-        rng = np.random.default_rng()
+    """Q-learning, SARSA or Expected SARSA, also with replacing traces."""
+    env, rng = make_env(), np.random.default_rng(None if fault == "not-reproducible" else seed)
     q = np.zeros((env.observation_space.n, env.action_space.n))
-    obs, _ = env.reset(seed=seed)
-    epsilon = exploration_initial_eps
-
-    def explores() -> bool:
-        if fault == "global-generator":
-            return bool(np.random.random() < epsilon)  # noqa: NPY002 (the fault)
-        return bool(rng.random() < epsilon)
+    traces, epsilon = np.zeros_like(q), exploration_initial_eps
+    discount = {"discount-twice": gamma**2, "discount-missing": 1.0}.get(fault, gamma)
+    fading = lam if fault == "lambda-alone" else gamma * lam
 
     def choose(state: int) -> int:
-        if explores():
+        drawn = np.random if fault == "global-generator" else rng
+        if drawn.random() < epsilon:
             return int(rng.integers(len(q[state])))
         return int(q[state].argmax())
 
+    obs, _ = env.reset(seed=seed)
     action = choose(obs)
     for step in range(steps):
-        share = step / steps
-        if fault == "schedule-backwards":
-            share = 1 - share
-        if fault == "schedule-constant":
-            share = 0.0
-        epsilon = exploration_initial_eps + share * (
-            exploration_final_eps - exploration_initial_eps
-        )
+        share = {"schedule-backwards": 1 - step / steps, "schedule-constant": 0.0}
+        falls = exploration_final_eps - exploration_initial_eps
+        epsilon = exploration_initial_eps + share.get(fault, step / steps) * falls
         following, reward, terminated, truncated, _ = env.step(action)
-        done = terminated or truncated
-        shown = following
+        shown, done = following, terminated or truncated
         if done:
             following, _ = env.reset()
         if fault == "reset-observation":
             shown = following
         next_action = choose(shown)
-        if target == "max":
-            value = q[shown].max()
-        elif target == "expected":
+        is_greedy = q[shown, next_action] == q[shown].max()
+        value = q[shown].max() if target == "max" else q[shown, next_action]
+        if target == "expected":
             value = epsilon * q[shown].mean() + (1 - epsilon) * q[shown].max()
-        else:
-            value = q[shown, next_action]
         ended = terminated and fault != "bootstraps-at-terminal"
-        discount = {"discount-twice": gamma**2, "discount-missing": 1.0}.get(fault, gamma)
-        goal = reward + (0.0 if ended else discount * value)
-        q[obs, action] += 0.1 * (goal - q[obs, action])
-        obs, action = following, choose(following) if done or target == "max" else next_action
+        error = reward + (0.0 if ended else discount * value) - q[obs, action]
+        traces[obs, action] = 1.0
+        q += learning_rate * error * traces
+        traces *= fading
+        is_cut = target == "max" and not is_greedy and fault != "never-cut"
+        if is_cut or (done and fault != "kept-across-episodes"):
+            traces[:] = 0.0
+        obs, action = following, choose(following) if done else next_action
     return Agent(q, 0.05 if fault == "explores-in-evaluation" else 0.0)
 
 
@@ -160,50 +154,6 @@ def several_steps(
         if done:
             obs, _ = env.reset()
             window = []
-    return Agent(q)
-
-
-def with_traces(
-    make_env: Callable[[], Any],
-    seed: int,
-    gamma: float,
-    steps: int,
-    lam: float = 0.9,
-    learning_rate: float = 0.1,
-    exploration_initial_eps: float = 1.0,
-    *,
-    target: str = "max",
-    fault: str = "",
-) -> Agent:
-    """SARSA(lambda) or Watkins's Q(lambda), with replacing traces."""
-    env, rng = make_env(), np.random.default_rng(seed)
-    q = np.zeros((env.observation_space.n, env.action_space.n))
-    traces = np.zeros_like(q)
-
-    def choose(state: int) -> int:
-        if rng.random() < exploration_initial_eps:
-            return int(rng.integers(len(q[state])))
-        return int(q[state].argmax())
-
-    obs, _ = env.reset(seed=seed)
-    action = choose(obs)
-    for _ in range(steps):
-        following, reward, terminated, truncated, _ = env.step(action)
-        next_action = choose(following)
-        is_greedy = q[following, next_action] == q[following].max()
-        value = q[following].max() if target == "max" else q[following, next_action]
-        error = reward + (0.0 if terminated else gamma * value) - q[obs, action]
-        traces[obs, action] = 1.0
-        q += learning_rate * error * traces
-        traces *= lam if fault == "lambda-alone" else gamma * lam
-        if target == "max" and not is_greedy and fault != "never-cut":
-            traces[:] = 0.0
-        obs, action = following, next_action
-        if terminated or truncated:
-            obs, _ = env.reset()
-            action = choose(obs)
-            if fault != "kept-across-episodes":
-                traces[:] = 0.0
     return Agent(q)
 
 

@@ -5,8 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from rl_yardstick.commands.audit import KINDS
-from rl_yardstick.diagnosis import agent_probes, subjects, target_probes
+from rl_yardstick.diagnosis import agent_probes, target_probes
 from rl_yardstick.diagnosis.audit import Verdict, audit
 from rl_yardstick.diagnosis.faults import FAULTS, Finding
 from rl_yardstick.diagnosis.probe_worlds import Record, World
@@ -19,11 +18,9 @@ from tests.diagnosis.planted_tables import (
     one_step,
     preferences,
     several_steps,
-    with_traces,
 )
 
 q_learning, sarsa = partial(one_step, target="max"), partial(one_step, target="next")
-sarsa_lambda = partial(with_traces, target="next")
 
 
 QUICK = {"policy_kwargs": {"net_arch": []}, "learning_rate": 0.03, "batch_size": 32}
@@ -64,9 +61,9 @@ OF_TABLES = {  # the fault: what has it, what that claims to be, and the probe t
     "shared-buffer": (from_memory, "q_learning", target_probes.probe_copies),
     "stale-buffer": (from_memory, "q_learning", target_probes.probe_age),
     "n-step-return": (several_steps, "sarsa", target_probes.probe_n_steps),
-    "traces, never-cut": (with_traces, "q_learning", target_probes.probe_traces),
-    "traces, lambda-alone": (sarsa_lambda, "sarsa", target_probes.probe_traces),
-    "traces, kept-across-episodes": (sarsa_lambda, "sarsa", target_probes.probe_traces),
+    "traces, never-cut": (q_learning, "q_learning", target_probes.probe_traces),
+    "traces, lambda-alone": (sarsa, "sarsa", target_probes.probe_traces),
+    "traces, kept-across-episodes": (sarsa, "sarsa", target_probes.probe_traces),
     "advantage-sign": (preferences, "actor_critic", agent_probes.probe_choice),
 }
 OF_CLASSES = {  # a class: its fault, and the probe that sees it
@@ -94,7 +91,6 @@ def test_each_fault_is_planted_once():
     planted = {row.partition(",")[0] for row in OF_TABLES}
     planted |= {fault for fault, _ in OF_CLASSES.values()}
     assert {*planted, "no-bootstrap-at-truncation"} == set(FAULTS)  # which SCRIPT has
-    assert tuple(subjects.KINDS) == KINDS
 
 
 @pytest.mark.parametrize("row", OF_TABLES)
@@ -109,7 +105,6 @@ RIGHT = {
     "Expected SARSA": (partial(one_step, target="expected"), "expected_sarsa"),
     "a memory": (from_memory, "q_learning"),
     "n steps": (several_steps, "sarsa"),
-    "Q(lambda)": (with_traces, "q_learning"),
     "actor-critic": (preferences, "actor_critic"),
 }
 

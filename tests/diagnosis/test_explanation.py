@@ -54,6 +54,42 @@ def parts_of(found):
     return {part.name: part.loss for part in found.parts}
 
 
+def tried_everything(agent):
+    agent.policy.visit_counts.fill_(10)
+
+
+FORGOTTEN = {(14, 2): 0.0, (13, 2): 0.0, (9, 1): 0.0, (10, 1): 0.0}
+SLIPS = {"env_kwargs": {"slip": 0.1}, "gamma": 0.5}
+EXPLORES = {"exploration_initial_eps": 0.1, "exploration_final_eps": 0.1, "gamma": 1.0}
+TREE = "n_step_tree_backup"
+ICE, CLIFF, CORRIDOR = "FrozenLake-v1", "CliffWalking-v1", "ShortCorridor-v0"
+# Agent, environment and entry; what is written into its table, or steps of training; a part, and
+# its loss, where None is the whole gap.
+PARTS = [
+    # At cell 14 the goal lies to the right, and it goes up.
+    ("qlearning", ICE, LAKE, with_values(0.95, {(14, 3): 1.01}), "look-ahead", 1.0),
+    # All values are zero: one look ahead sees the goal from cell 14 alone.
+    ("qlearning", ICE, LAKE, tried_everything, "not settled", 1.0),
+    # The only way out of cell 14, and the values behind it, without a trial.
+    ("qlearning", ICE, LAKE, with_values(0.95, FORGOTTEN, [(14, 2)]), "never tried", 1.0),
+    # At discount 0.5 a slipping robot does better to stand still than to risk a shelf.
+    ("qlearning", "Warehouse-v0", SLIPS, with_values(0.5), "objective", None),
+    # Sutton and Barto, example 6.6: with epsilon 0.1 the best is the safer way, here of 15.
+    ("sarsa", CLIFF, EXPLORES, 2000, "exploring", 2.0),
+    (TREE, CLIFF, {**EXPLORES, "target_policy": "exploring"}, 2000, "exploring", 2.0),
+    (TREE, CLIFF, {**EXPLORES, "target_policy": "greedy"}, 2000, "exploring", 0.0),
+    ("qlearning", CORRIDOR, {}, 100, "not observable", 8.657),
+]
+
+
+@pytest.mark.parametrize(("algo", "env_id", "entry", "done", "name", "loss"), PARTS)
+def test_each_handicap_has_its_part(algo, env_id, entry, done, name, loss):
+    steps = done if isinstance(done, int) else 0
+    found = explained(algo, env_id, entry, None if steps else done, steps)
+    loss = found.gap if loss is None else loss
+    assert parts_of(found).get(name, 0.0) == pytest.approx(loss, abs=0.001)
+
+
 def test_an_optimal_agent_has_nothing_to_explain():
     found = explained("qlearning", "FrozenLake-v1", LAKE, with_values(0.95))
     assert found.is_optimal
@@ -65,7 +101,6 @@ def test_one_wrong_action_is_named_with_what_mending_it_regains():
     wrong = {(14, 3): 1.01}
     found = explained("qlearning", "FrozenLake-v1", LAKE, with_values(0.95, wrong))
     assert found.gap == pytest.approx(1.0)
-    assert parts_of(found)["look-ahead"] == pytest.approx(1.0)
     assert found.is_caught
     assert "circles between" in found.ending
     assert [(name, pytest.approx(value)) for name, value in found.repairs] == [
@@ -76,16 +111,6 @@ def test_one_wrong_action_is_named_with_what_mending_it_regains():
         "row 4, column 3: up, where right is best"
     )
     assert found.own_gap == pytest.approx(0.95**5)  # six moves, the last of which pays
-
-
-def test_values_that_have_not_come_to_the_start_are_not_settled():
-    """All zero, though every pair was tried: one look ahead sees the goal from cell 14 alone."""
-    found = explained(
-        "qlearning", "FrozenLake-v1", LAKE, lambda agent: agent.policy.visit_counts.fill_(10)
-    )
-    parts = {name: loss for name, loss in parts_of(found).items() if abs(loss) > 1e-9}
-    assert parts == {"not settled": pytest.approx(1.0)}
-    assert not found.is_concentrated  # it is caught where it starts
 
 
 def test_a_loss_in_few_states_is_told_state_by_state():
@@ -100,42 +125,14 @@ def test_a_loss_in_few_states_is_told_state_by_state():
     assert not explained("qlearning", "FrozenLake-v1", LAKE, with_values(0.95)).is_concentrated
 
 
-def test_an_action_that_was_never_tried_is_told_from_one_of_wrong_value():
-    """The only way out of the corridor at cell 14, and the values behind it, without a trial."""
-    untried = [(14, 2)]
-    wrong = {(14, 2): 0.0, (13, 2): 0.0, (9, 1): 0.0, (10, 1): 0.0}
-    found = explained("qlearning", "FrozenLake-v1", LAKE, with_values(0.95, wrong, untried))
-    assert parts_of(found)["never tried"] == pytest.approx(1.0)
-
-
-def test_a_discount_that_hides_the_goal_is_the_objective_s_part():
-    """At discount 0.5 a slipping robot does better to stand still than to risk a shelf."""
-    entry = {"env_kwargs": {"slip": 0.1}, "gamma": 0.5}
-    found = explained("qlearning", "Warehouse-v0", entry, with_values(0.5))
-    assert parts_of(found)["objective"] == pytest.approx(found.gap)
+def test_a_discount_that_hides_the_goal_is_to_be_raised():
+    found = explained("qlearning", "Warehouse-v0", SLIPS, with_values(0.5))
     assert found.own_gap == pytest.approx(0.0, abs=1e-9)
     assert found.proposals[0] == "gamma:auto"
 
 
-@pytest.mark.parametrize(
-    ("algo", "more", "lost"),
-    [
-        ("sarsa", {}, 2.0),
-        ("n_step_tree_backup", {"target_policy": "exploring"}, 2.0),
-        ("n_step_tree_backup", {"target_policy": "greedy"}, 0.0),
-    ],
-)
-def test_what_learns_while_exploring_walks_around_the_cliff(algo, more, lost):
-    """Sutton and Barto, example 6.6: with epsilon 0.1 the best is the safer way, here of 15."""
-    entry = {"exploration_initial_eps": 0.1, "exploration_final_eps": 0.1, "gamma": 1.0, **more}
-    found = explained(algo, "CliffWalking-v1", entry, steps=2000)
-    assert found.optimum == pytest.approx(-13)
-    assert parts_of(found).get("exploring", 0.0) == pytest.approx(lost)
-
-
-def test_what_cannot_be_observed_is_a_part_of_its_own():
+def test_states_that_look_alike_are_named():
     found = explained("qlearning", "ShortCorridor-v0", steps=100)
-    assert parts_of(found)["not observable"] == pytest.approx(8.657, abs=0.001)
     assert found.looks_alike
     assert found.repairs == ()
     assert "cannot tell 3 states apart" in why_lines(found)[-1]

@@ -21,7 +21,7 @@ from rl_yardstick.experiments.results import (
 )
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline.run import FINISHED
-from rl_yardstick.report.conclusions import places_without_a_run
+from rl_yardstick.report.words import places_without_a_run
 from rl_yardstick.report.documents import write_tables
 from rl_yardstick.report.figures import write_figures
 from rl_yardstick.report.series import episodes_table, study_series

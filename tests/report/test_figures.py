@@ -113,9 +113,10 @@ def drawn(monkeypatch):
         canvas.figure.set_dpi(100)
         canvas.draw()
         found.append(canvas.figure)
+        file.touch()
 
     monkeypatch.setattr(FigureCanvasAgg, "print_png", draw)
-    monkeypatch.setattr(FigureCanvasSVG, "print_svg", lambda *_, **__: None)
+    monkeypatch.setattr(FigureCanvasSVG, "print_svg", lambda _, file, **__: file.touch())
     return found
 
 
@@ -333,11 +334,17 @@ def test_nothing_is_cut_by_matplotlibs_own_extents(drawn, tmp_path):
 MARKS = {"first": Mark("first", 1, "dash"), "second": Mark("second", 0, "solid")}
 
 
+def drawn_curves(place, *curves, **evaluation):
+    """Panels of both kinds; the budget of evaluations may be changed."""
+    axes, found = Figure().subplots(1, 2), curves_of(["first", "second"], *curves)
+    found["evaluation"] = replace(found["evaluation"], **evaluation)
+    draw_learning_curves(axes, EnvironmentSeries(place, found, (), None, {}), MARKS)
+    return axes
+
+
 def test_what_stands_beside_curves():
-    left, right = Figure().subplots(1, 2)
-    curves = curves_of(["first", "second"], 79.0, ("first", "second"))
     place = made_up.environment(optimum_at_least=90.0, optimum_is_proven=False)
-    draw_learning_curves([left, right], curves, place, MARKS)
+    left, _ = drawn_curves(place, 79.0, ("first", "second"))
     *lines, legend = described(left.figure)
     assert legend == (
         "names first, second, optimum, at most (not proven), optimum, at least, best random or "
@@ -350,34 +357,37 @@ def test_what_stands_beside_curves():
     assert ticks == [-1000, -300, -100, -50, 0, 50, 100, 300, 1000]
 
 
-def test_panels_of_one_metric_have_one_y_axis_and_evaluations_the_axis_of_the_budget():
-    for on_variant, scale, is_shared in (
-        ((), None, True),
-        ((), 79.0, True),
-        (("first",), 79.0, False),
-    ):
-        left, right = Figure().subplots(1, 2)
-        curves = curves_of(["first", "second"], scale, on_variant)
-        curves["evaluation"] = replace(curves["evaluation"], budget="episode")
-        draw_learning_curves([left, right], curves, made_up.environment(), MARKS)
-        assert (left.get_ylim() == right.get_ylim()) == is_shared
-        assert (left.get_yscale() == right.get_yscale()) == is_shared
-        assert left.get_xlabel() == "episodes"
+@pytest.mark.parametrize(
+    ("scale", "on_variant", "is_shared"),
+    [(None, (), True), (79.0, (), True), (79.0, ("first",), False)],
+)
+def test_panels_of_one_metric_have_one_y_axis_and_evaluations_the_axis_of_the_budget(
+    scale, on_variant, is_shared
+):
+    left, right = drawn_curves(made_up.environment(), scale, on_variant, budget="episode")
+    assert (left.get_ylim() == right.get_ylim()) == is_shared
+    assert (left.get_yscale() == right.get_yscale()) == is_shared
+    assert left.get_xlabel() == "episodes"
 
 
-def test_an_interval_of_one_point_has_a_mark_and_few_runs_have_their_range():
-    for low, high, n, expected, said in (
+@pytest.mark.parametrize(
+    ("low", "high", "n", "expected", "said"),
+    [
         (80, 95, 5, "orange - (80 0) (95 0)", "mean, 95 % interval, each seed"),
         (90, 90, 5, "orange D (90 0) (90 0)", "each seed; diamond: all runs are equal"),
         (88, 92, 2, "orange - (88 0) (92 0)", "mean, range, each seed"),
-    ):
-        axes, mean = Figure().subplots(), made_up.estimate(90.0, low, high, n)
-        runs = AgentRuns("first", mean, np.arange(2), np.array([88, 92]))
-        draw_runs(axes, [runs], made_up.environment(), "final", MARKS)
-        dots, interval, tick, _ = map(line_words, axes.get_lines())
-        assert (dots, tick) == ("orange . (88 -0.18) (92 0.18)", "orange | (90 0)")
-        assert interval == expected
-        assert axes.get_xlabel().replace("\n", " ").endswith(said)
+    ],
+)
+def test_an_interval_of_one_point_has_a_mark_and_few_runs_have_their_range(
+    low, high, n, expected, said
+):
+    axes, mean = Figure().subplots(), made_up.estimate(90.0, low, high, n)
+    runs = [AgentRuns("first", mean, np.arange(2), np.array([88, 92]))]
+    draw_runs(axes, EnvironmentSeries(made_up.environment(), None, runs, None, {}), "final", MARKS)
+    dots, interval, tick, _ = map(line_words, axes.get_lines())
+    assert (dots, tick) == ("orange . (88 -0.18) (92 0.18)", "orange | (90 0)")
+    assert interval == expected
+    assert axes.get_xlabel().replace("\n", " ").endswith(said)
 
 
 def test_names_at_the_ends_of_lines_never_overlap_and_make_the_figure_as_tall_as_they_need():

@@ -86,7 +86,7 @@ def page(text):
 
 def test_settings_say_how_it_was_done_and_what_failed_and_not_where(page, report_study):
     assert [*page.sections] == SECTION_NAMES
-    settings, info = page.sections["settings"], report_study.planned[0].run.read_info()
+    settings, info = page.sections["settings"], report_study.planned[0].recorded()
     for part in ("python compare.py 'a & b.yml'", info["versions"]["numpy"]):
         assert part in settings
     assert info["machine"]["processor"] in settings
@@ -123,7 +123,7 @@ def test_the_maps_are_those_of_the_run_folders(page, report_study):
     assert data["rows"] == ["S...", ".X.X", "...X", "X..G"]
     run = next(r for r in data["runs"] if (r["agent"], r["seed"]) == ("sarsa", 0))
     folder = next(r for r in report_study.planned if r.agent == "sarsa" and r.seed == 0)
-    with np.load(folder.run.value_maps_path) as maps:
+    with np.load(folder.path / "value_maps.npz") as maps:
         assert run["steps"] == maps["timesteps"].tolist()
         assert run["values"][-1] == pytest.approx(maps["values"][-1].tolist(), rel=1e-4)
         assert [int(digit) for digit in run["actions"][-1]] == maps["actions"][-1].tolist()
@@ -226,7 +226,7 @@ def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_st
     lake = page.data("data-diagnosis-0")
     assert lake["v_error"].keys() == {"qlearning", "sarsa"}
     assert lake["overestimation"].keys() == {"qlearning"}
-    runs = [one.run for one in results.planned if one.labels == ("sarsa", "lake")]
+    runs = [one.path for one in results.planned if one.labels == ("sarsa", "lake")]
     curve = lake["v_error"]["sarsa"]
     assert curve["x"][-1] == 400
     assert curve["y"][-1] == pytest.approx(

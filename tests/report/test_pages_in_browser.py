@@ -9,15 +9,11 @@ import time
 import gymnasium as gym
 import pytest
 from gymnasium.envs.toy_text import TaxiEnv
-from rich.console import Console
-from rl_yardstick.pipeline.settings.hyperparams import split
-from rl_yardstick.pipeline.train_spec import TrainSpec
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
-from rl_yardstick.pipeline.training import carry_out, prepare
 from rl_yardstick.report.page.learning import write_learning_page
 from rl_yardstick.report.page.tuning import write_tuning_page
 
@@ -226,20 +222,17 @@ class Hostile(TaxiEnv):
 
 
 @pytest.fixture(scope="module")
-def trainings(tmp_path_factory):
-    """With a page of each: a hostile table without a map, a network."""
+def trainings(tmp_path_factory, watched):
+    """What was recorded and the page: of a hostile table without a map, of a network."""
     folder = tmp_path_factory.mktemp("learning")
     gym.register("Hostile-v0", Hostile, max_episode_steps=100)
     done = {}
     try:
-        for name, (env_id, algo, entry) in ASKED.items():
-            kept = {"log_folder": folder / name, "watch_learning": folder / f"{name}.html"}
-            common = {"seed": 0, "verbose": 0, "pictures": False, **kept}
-            spec = TrainSpec(algo, env_id, split(entry), entry, **common)
-            done[name] = prepare(spec, Console(quiet=True), {}, "")
-            carry_out(done[name])
+        for name, asked in ASKED.items():
+            spec, watch = watched(*asked, seed=0)
             title = f"{HOSTILE} on Hostile-v0" if name == "rows" else ""
-            write_learning_page(spec, done[name].watch, spec.watch_learning, title)
+            write_learning_page(spec, watch, folder / f"{name}.html", title)
+            done[name] = watch, folder / f"{name}.html"
     finally:
         del gym.registry["Hostile-v0"]
     return done
@@ -247,10 +240,10 @@ def trainings(tmp_path_factory):
 
 @pytest.fixture
 def played(browser, trainings):
-    """Loads one of these pages; the training that it shows."""
+    """Loads one of these pages; what was recorded, and the page."""
 
     def load(name, width=1280):
-        browser.load(trainings[name].spec.watch_learning, width)
+        browser.load(trainings[name][1], width)
         browser.wait(lambda: browser.find("#moment").text)
         return trainings[name]
 
@@ -268,8 +261,8 @@ def fact(browser, name):
 
 
 def test_steps_are_played_by_keyboard_and_hostile_names_are_text(browser, played):
-    training = played("rows")
-    moment, rows = browser.find("#moment"), training.watch.moves.rows
+    watch, _ = played("rows")
+    moment, rows = browser.find("#moment"), watch.moves.rows
     assert moment.text == "step 0 of 300"
     browser.press(Keys.ARROW_RIGHT)
     assert float(fact(browser, "target")) == pytest.approx(rows["target"][0], rel=1e-5)
@@ -286,7 +279,7 @@ def test_steps_are_played_by_keyboard_and_hostile_names_are_text(browser, played
     for row in shown:
         state = int(row.find_element(By.CSS_SELECTOR, "th").text.removeprefix("state "))
         numbers = [float(cell.text) for cell in row.find_elements(By.CSS_SELECTOR, "td")]
-        expected = training.model.policy.q_table[state].tolist()
+        expected = watch.model.policy.q_table[state].tolist()
         assert numbers == pytest.approx(expected, rel=1e-3, abs=1e-9)
     assert browser.driver.title == f"{HOSTILE} on Hostile-v0: learning"
     assert browser.find("h1").text == f"{HOSTILE} on Hostile-v0"
@@ -295,7 +288,7 @@ def test_steps_are_played_by_keyboard_and_hostile_names_are_text(browser, played
 
 @pytest.mark.parametrize("name", ASKED)
 def test_on_a_phone_it_has_large_buttons_with_names_and_no_sideways_scroll(browser, played, name):
-    training = played(name, width=390)
+    _, path = played(name, width=390)
     browser.press(Keys.END)
     browser.fits(390)
     # No figure stands letter below letter.
@@ -305,4 +298,4 @@ def test_on_a_phone_it_has_large_buttons_with_names_and_no_sideways_scroll(brows
             assert min(button.size.values()) >= 44
             assert button.text or button.get_attribute("aria-label")
     assert all(picture.get_attribute("aria-label") for picture in browser.all("svg"))
-    browser.asks_nobody(training.spec.watch_learning)
+    browser.asks_nobody(path)

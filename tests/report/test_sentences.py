@@ -15,15 +15,13 @@ from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.report.conclusions import conclusion, pairs_both_ways, unseen_sentence
 from rl_yardstick.report.documents import headline, verdicts_as
+from rl_yardstick.report.words import conclusion, pairs_both_ways, unseen_sentence
 from rl_yardstick.verdicts import Best, ThresholdSummary
 from tests.report import made_up
 
 NAN, INF = math.nan, math.inf
 
-
-# --- who is best ----------------------------------------------------------------------------------
 
 MEANS = {"a": 100.0, "b": 90.0, "c": 80.0}
 TWO = {"a": 100.0, "b": 90.0}
@@ -62,45 +60,39 @@ def test_who_is_best(means, changes, lead):
     assert said(place_of({}, means, **changes)).lead == lead
 
 
-# --- pairs, and what else there is to say ---------------------------------------------------------
+OPEN = (made_up.pair(*"ab", "undecided", seeds_needed=793), made_up.pair(*"ac", "undecided"))
+FEW = (made_up.pair(*"ab", "tied", so_far=True), made_up.pair(*"ac", "better", so_far=True))
 
 
-def test_pairs_with_one_word_stand_in_one_sentence_of_the_better_agent():
-    # Ranks go by the mean: the first of a pair may be the worse one.
-    words = {"ab": "worse", "ac": "better", "bc": "better"}
-    assert said(place_of(words)).pairs == (
-        "a is better than c (by 0.05 to 0.15 of the score).",
-        (
-            "b is better than a (by -0.15 to -0.05 of the score) and c (by 0.05 to 0.15 of the "
-            "score)."
-        ),
-    )
-    open_ = (made_up.pair(*"ab", "undecided", seeds_needed=793), made_up.pair(*"ac", "undecided"))
-    assert said(place_of({}, pairs=open_)).pairs == (
-        (
-            "a is undecided against b (difference 0.05 to 0.15 of the score; about 793 seeds would "
-            "decide) and c (difference 0.05 to 0.15 of the score)."
-        ),
-    )
-    few = (made_up.pair(*"ab", "tied", so_far=True), made_up.pair(*"ac", "better", so_far=True))
-    grown = place_of({}, pairs=few, looks=(4, 8), is_score=False, margin=2.0)
-    assert said(grown).pairs == (
-        "a is better so far than c (by 0.05 to 0.15; with 4 seeds).",
-        "a is tied so far with b (within 2; with 4 seeds).",
-    )
-
-
-def stays(share, steps):
-    return ThresholdSummary(made_up.estimate(steps, n=4), made_up.estimate(share, n=4))
+@pytest.mark.parametrize(
+    ("words", "changes", "sentences"),
+    [
+        # Ranks go by the mean: the first of a pair may be the worse one.
+        ({"ab": "worse", "ac": "better", "bc": "better"}, {}, [
+            "a is better than c (by 0.05 to 0.15 of the score).",
+            ("b is better than a (by -0.15 to -0.05 of the score) and c (by 0.05 to 0.15 of the "
+            "score)."),
+        ]),
+        ({}, {"pairs": OPEN}, [
+            ("a is undecided against b (difference 0.05 to 0.15 of the score; about 793 seeds "
+            "would decide) and c (difference 0.05 to 0.15 of the score).")
+        ]),
+        ({}, {"pairs": FEW, "looks": (4, 8), "is_score": False, "margin": 2.0}, [
+            "a is better so far than c (by 0.05 to 0.15; with 4 seeds).",
+            "a is tied so far with b (within 2; with 4 seeds).",
+        ]),
+    ],
+)  # fmt: skip
+def test_pairs_with_one_word_stand_in_one_sentence_of_the_better_agent(words, changes, sentences):
+    assert said(place_of(words, **changes)).pairs == tuple(sentences)
 
 
 def test_how_soon_agents_arrive():
-    agents = [
-        made_up.agent("slow", 90.0, steps_to_stay=stays(0.75, 3000.0)),
-        made_up.agent("quick", 80.0, steps_to_stay=stays(1.0, 1000.0)),
-        made_up.agent("late", 70.0, steps_to_stay=stays(0.25, INF)),
-        made_up.agent("never", 60.0, steps_to_stay=stays(0.0, INF)),
-    ]
+    stays = {"slow": (0.75, 3000.0), "quick": (1.0, 1000.0), "late": (0.25, INF), "never": (0, INF)}
+    agents = []
+    for name, (share, steps) in stays.items():
+        found = ThresholdSummary(made_up.estimate(steps, n=4), made_up.estimate(share, n=4))
+        agents.append(made_up.agent(name, 90.0 - len(agents), steps_to_stay=found))
     assert said(made_up.environment(agents)).notes == (
         (
             "quick stays above a score of 0.95 in 4 of 4 runs, in the median run from step 1,000; "
@@ -110,14 +102,10 @@ def test_how_soon_agents_arrive():
     )
 
 
-def failing(place):
-    agents = [made_up.failing(place.agents[0], 3, 20), *place.agents[1:]]
-    return replace(place, agents=tuple(agents))
-
-
 @pytest.mark.parametrize(
     ("changes", "notes"),
     [
+        ({}, []),
         ({"optima": {"a": 1.0, "b": 2.0}}, [("The agents do NOT PLAY THE SAME ENVIRONMENT: the "
           "optimum is 1 for a and 2 for b. Their returns cannot be compared.")]),
         ({"optimum": 101.0, "impossible": ("a",)}, [("a has MORE THAN ANY POLICY CAN REACH, "
@@ -129,13 +117,15 @@ def failing(place):
     ],
 )  # fmt: skip
 def test_what_else_is_said(changes, notes):
-    assert list(said(place_of({}, TWO, **changes)).notes) == notes
-    assert said(failing(place_of({}, TWO))).notes == ("3 of 20 runs of a failed.",)
+    place = place_of({}, TWO, **changes)
+    failing = made_up.failing(place.agents[0], 3, 20)
+    for agents, first in ((place.agents, []), ((failing,), ["3 of 20 runs of a failed."])):
+        told = said(replace(place, agents=(*agents, *place.agents[1:])[:2])).notes
+        assert list(told) == [*first, *notes]
 
 
 def test_once_a_page_it_is_said_what_so_few_runs_cannot_show():
-    place = failing(place_of({}, TWO))
-    few = made_up.analysis([place], ["a", "b"])
+    few = made_up.analysis([place_of({}, TWO)], ["a", "b"])
     assert unseen_sentence(few) == (
         "A failure that no run showed is not counted: with 4 runs up to 53 % of further runs "
         "could fail."

@@ -8,8 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
-from rl_yardstick.pipeline.settings.hyperparams import split
-from rl_yardstick.pipeline.train_spec import TrainSpec
 from scipy import integrate
 
 import rl_yardstick.envs  # noqa: F401  # registers the bandits
@@ -17,6 +15,7 @@ from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.bandits import pull_statistics
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.report.series import (
     auer_bound,
     best_expected_reward,
@@ -83,15 +82,10 @@ def test_a_curve_of_single_points_is_left_out_and_episodes_are_the_axis_of_their
     found = learning_curves(replace(results, curves=first), place)
     assert not any(of_agents for each in found.values() for of_agents in each.by_axis.values())
     for budget, expected in (({"n_episodes": 9}, "episode"), ({"n_timesteps": 9}, "step")):
-        spec = TrainSpec("qlearning", "FrozenLake-v1", split(budget), budget, 0)
-        planned = (
-            PlannedRun("b", "lake", 0, spec, Path()),
-            PlannedRun("b", "other", 0, spec, Path()),
-        )
-        assert (
-            learning_curves(replace(results, planned=planned), place)["evaluation"].budget
-            == expected
-        )
+        spec = TrainSpec(algo="qlearning", env_id="FrozenLake-v1", **budget)
+        runs = tuple(PlannedRun("b", name, 0, spec, Path()) for name in ("lake", "other"))
+        curves = learning_curves(replace(results, planned=runs), place)
+        assert curves["evaluation"].budget == expected
 
 
 def test_runs_with_a_figure_by_seed(lake):

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import pytest
 
-from rl_yardstick.report.conclusions import conclusion
 from rl_yardstick.report.documents import (
     MARKUPS,
     headline,
@@ -25,6 +24,7 @@ from rl_yardstick.report.page import result_sections
 from rl_yardstick.report.page.frame import Report
 from rl_yardstick.report.ranking import COLUMNS, Row
 from rl_yardstick.report.series import StudySeries
+from rl_yardstick.report.words import conclusion
 from rl_yardstick.verdicts import Best, Estimate, ThresholdSummary
 from tests.report import made_up
 
@@ -146,12 +146,6 @@ def tables_of(agents, **changes):
     return table
 
 
-def ranked(agents, **changes):
-    """Headings of the ranking and its rows."""
-    table = tables_of(agents, **changes)
-    return table["headings"], table["rows"]
-
-
 RANKING = """
 Mean       | over seeds          | descending | 90    89.9 to 90.2 | 40    39.9 to 40.2
 IQM        | middle half         | descending | 92                 | 42
@@ -172,15 +166,18 @@ def test_figures_of_each_agent_the_best_first():
         made_up.agent("first", 90.0),
         made_up.failing(made_up.agent("second", 40.0, n_missing=1), 2, 4),
     ]
-    headings, rows = ranked(agents)
-    assert [row.agent for row, _ in rows] == ["first", "second"]
+    table = tables_of(agents)
+    assert [row.agent for row, _ in table["rows"]] == ["first", "second"]
+    cells = [cells for _, cells in table["rows"]]
+    shown = [
+        [column.page, column.help.format(**table["words"]), order]
+        + [f"{row[n].text} {row[n].note}".strip() for row in cells]
+        for n, (column, order) in enumerate(zip(table["columns"], table["orders"], strict=True))
+    ]
     expected = [[" ".join(x.split()) for x in row.split("|")] for row in RANKING.split("\n")[1:-1]]
-    assert [
-        [*each.values(), *(f"{cells[n].text} {cells[n].note}".strip() for _, cells in rows)]
-        for n, each in enumerate(headings)
-    ] == expected
+    assert shown == expected
     # They are sorted by their figures.
-    values = [cell.value for cell in rows[0][1]]
+    values = [cell.value for cell in cells[0]]
     assert values == pytest.approx([90, 92, 91, 0.9, 0, 7, 0.5, 100, 98, 99, 4])
 
 
@@ -197,8 +194,9 @@ def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
         made_up.agent("slow", 1.0, steps_to_stay=never),
         made_up.agent("without", math.nan, **without),
     ]
-    headings, ((_, slow), (_, absent)) = ranked(agents)
-    titles = [heading["title"] for heading in headings]
+    table = tables_of(agents)
+    titles = [column.page for column in table["columns"]]
+    (_, slow), (_, absent) = table["rows"]
     stays = slow[titles.index("Stays from")]
     assert (stays.text, stays.value, stays.note) == ("never", math.inf, "25% of runs")
     for title in ("Mean", "Score", "Gap", "Success", "Stays from", "CPU time"):
@@ -215,21 +213,12 @@ def test_returns_beside_that_of_the_greedy_policy_stand_below_the_ranking():
         made_up.agent("plain", 40.0),
     ]
     table = tables_of(agents)["others"]
-    shown = [
-        [agent.agent, *(f"{cell.text} {cell.note}".strip() for cell in cells)]
-        for agent, cells in table["rows"]
-    ]
-    assert [heading["title"] for heading in table["headings"]] == [
-        *("Greedy", "Stochastic", "Discounted"),
-    ]
+    assert [column.page for column in table["columns"]] == ["Greedy", "Stochastic", "Discounted"]
+    shown = [[f"{cell.text} {cell.note}".strip() for cell in cells] for _, cells in table["rows"]]
     assert shown == [
-        [
-            "both",
-            "93 92.9 to 93.2",
-            "70 69.9 to 70.2; epsilon 0.1",
-            "30 29.9 to 30.2; by 0.9; optimum 34.5",
-        ],
-        ["plans", "83 82.9 to 83.2", "unknown", "unknown"],
-        ["plain", "43 42.9 to 43.2", "unknown", "-"],
-    ]
+        ["93 92.9 to 93.2", "70 69.9 to 70.2; epsilon 0.1",
+         "30 29.9 to 30.2; by 0.9; optimum 34.5"],
+        ["83 82.9 to 83.2", "unknown", "unknown"],
+        ["43 42.9 to 43.2", "unknown", "-"],
+    ]  # fmt: skip
     assert tables_of(agents[1:])["others"] is None

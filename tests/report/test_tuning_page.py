@@ -6,6 +6,7 @@ import re
 import optuna
 import pytest
 
+from rl_yardstick.report.page.frame import as_json
 from rl_yardstick.report.page.tuning import (
     Trials,
     changes,
@@ -17,9 +18,13 @@ from rl_yardstick.report.page.tuning import (
 )
 
 
+def shown_of(record):
+    """The history as the page has it."""
+    return json.loads(as_json(history(Trials(record))))
+
+
 def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
-    trials = Trials(tuning_record)
-    shown = history(trials)
+    shown = shown_of(tuning_record)
     assert shown["numbers"] == [0, 1, 2, 3, 4, 6]
     assert shown["best"] == [0.6, 0.6, 0.8, 0.8, 0.8, 0.8]
     assert shown["values"]["judged on all seeds"] == [0.6, None, 0.8, 0.7, None, None]
@@ -28,12 +33,7 @@ def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
     assert shown["texts"][1] == "trial 1: -30 on 1 seed"
     # The one far off lies beyond the edge of the axis, and all others inside.
     assert -30.0 < shown["edge"] < 0.6
-    assert [trial["number"] for trial in trials.best_first] == [2, 3, 0, 1, 4, 6]
-    # A cost is the better the lower.
-    tuning_record["lower_is_better"] = True
-    trials = Trials(tuning_record)
-    assert history(trials)["best"] == [0.6, 0.6, 0.6, 0.6, 0.6, 0.6]
-    assert [trial["number"] for trial in trials.best_first] == [0, 3, 2, 1, 4, 6]
+    assert shown_of({**tuning_record, "lower_is_better": True})["best"] == [0.6] * 6
 
 
 EDGES = [
@@ -54,21 +54,23 @@ def test_the_axis_shows_where_the_best_are_told_apart(tuning_record, tuning_tria
     for values, pruned, edge in EDGES:
         trials = [tuning_trial(n, sign * v, {"1": 0.0, "0": 0.0}) for n, v in enumerate(values)]
         trials += [tuning_trial(n, sign * v, {"1": 0.0}, "pruned") for n, v in pruned.items()]
-        shown = history(Trials({**tuning_record, "trials": trials, "lower_is_better": is_cost}))
+        shown = shown_of({**tuning_record, "trials": trials, "lower_is_better": is_cost})
         assert shown["edge"] == (None if edge is None else pytest.approx(sign * edge))
 
 
-def test_settings_with_the_optimum_are_ranked_by_their_steps(tuning_record, tuning_trial, tmp_path):
-    both = {"1": 1.0, "0": 1.0}
-    trials = [tuning_trial(n, 1.0, both) for n in range(4)]
+def test_trials_are_ranked_by_value_and_those_with_the_optimum_by_their_steps(
+    tuning_record, tuning_trial
+):
+    trials = [tuning_trial(n, 1.0, {"1": 1.0, "0": 1.0}) for n in range(4)]
     for number, steps in ((1, (30, 50)), (3, (20, 40)), (2, (1,))):
         trials[number]["at_optimum"] = dict(zip(("1", "0"), steps, strict=False))
-    record = {**tuning_record, "trials": trials, "n_at_optimum": 2}
-    assert [trial["number"] for trial in Trials(record).best_first] == [3, 1, 0, 2]
-    write_tuning_page(record, tmp_path / "report.html")
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "2 settings have the optimum on all seeds of the search" in text
-    assert "threshold, and more trials were not needed." in text
+    for fields, ranked in (
+        ({}, [2, 3, 0, 1, 4, 6]),
+        ({"lower_is_better": True}, [0, 3, 2, 1, 4, 6]),
+        ({"trials": trials}, [3, 1, 0, 2]),
+    ):
+        found = Trials({**tuning_record, **fields}).best_first
+        assert [trial["number"] for trial in found] == ranked
 
 
 def test_lines_run_through_the_parameters_between_their_ends(tuning_record):
@@ -87,7 +89,7 @@ def test_lines_run_through_the_parameters_between_their_ends(tuning_record):
 
 def test_the_parameter_that_decides_matters_most(tuning_record, tuning_trial):
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(0))
-    space = Trials(tuning_record).distributions()
+    space = Trials(tuning_record).distributions
     drawn = [study.ask(space).params for _ in range(60)]
     tuning_record["trials"] = [
         tuning_trial(number, -abs(params["steps"] - 3), {"1": 0.0}, **params)
@@ -112,10 +114,7 @@ def test_tables_have_the_cost_and_what_changed(tuning_record):
         ("From the first trial to the end of the last", "66 s"),
         ("Runs of the re-test", "8"),
     ]
-    assert [change._asdict() for change in changes(trials, 2)] == [
-        {"name": "learning_rate", "shipped": "0", "found": "2"},
-        {"name": "tau", "shipped": "-", "found": "1.0"},
-    ]
+    assert changes(trials, 2) == [("learning_rate", "0", "2"), ("tau", "-", "1.0")]
 
 
 def test_the_page_is_one_file_that_says_what_won(tuning_record, tmp_path):
@@ -140,6 +139,8 @@ def test_the_page_is_one_file_that_says_what_won(tuning_record, tmp_path):
     ):
         assert part in text
     assert re.findall(r'(?:src|href)="(?!#|data:|retest/)[^"]*"', text) == []
-    text, sections = page(trials=[], retest=None)
+    text, sections = page(trials=[], retest=None, n_at_optimum=2)
     assert "There has been no re-test yet" in text
+    assert "2 settings have the optimum on all seeds of the search" in text
+    assert "threshold, and more trials were not needed." in text
     assert sections == ["verdict", "history", "cost", "trials"]

@@ -45,27 +45,26 @@ def render(report: Report, sections: list[Section]) -> str:
     environment = frame.templates()
     study, environments = report.analysis.study, report.analysis.environments
     shared = {"study": study, "environments": environments, "marks": report.series.marks}
-    bodies = {
-        section.name: Markup(  # noqa: S704  # a template's output, escaped already
-            environment.get_template(f"{section.name}.html").render(**shared, **section.context)
-        )
-        for section in sections
-    }
+    bodies = {}
+    for section in sections:
+        template = environment.get_template(f"{section.name}.html")
+        is_there = [item is not None for item in section.places]
+        body = template.render(**shared, is_there=is_there, **section.context)
+        bodies[section.name] = Markup(body)  # noqa: S704  # escaped already
+    facts = ("optimum", "optimum_at_least", "optimum_is_proven", "baseline")
     places = [
         {
             "label": one.environment,
-            "optimum": one.optimum,
-            "optimum_at_least": one.optimum_at_least,
-            "optimum_is_proven": one.optimum_is_proven,
-            "baseline": one.baseline,
             "agents": [agent.agent for agent in one.agents],
+            **{name: getattr(one, name) for name in facts},
         }
         for one in environments
     ]
     data = {"page": {"agents": list(report.series.marks.values()), "environments": places}}
     for section in sections:
-        data[section.name] = section.data
-        data |= {f"{section.name}-{place}": item for place, item in enumerate(section.places)}
+        found = {section.name: section.data}
+        found |= {f"{section.name}-{place}": item for place, item in enumerate(section.places)}
+        data |= {name: item for name, item in found.items() if item is not None}
     moving = [section for section in sections if section.data is not None or section.places]
     scripts = [*frame.SHARED, *(f"{section.name}.js" for section in moving), "paper.js"]
     return environment.get_template("page.html").render(
@@ -75,8 +74,6 @@ def render(report: Report, sections: list[Section]) -> str:
         sections=sections,
         bodies=bodies,
         is_sweep=any(one.sweeps or one.grids for one in report.series.environments),
-        data={
-            name: frame.packed(frame.as_json(one)) for name, one in data.items() if one is not None
-        },
+        data={name: frame.packed(frame.as_json(one)) for name, one in data.items()},
         **frame.page_frame(scripts),
     )

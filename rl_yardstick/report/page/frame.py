@@ -57,7 +57,8 @@ def templates(folder: str = "") -> Environment:
         interval=interval_alone,
         score=score_number,
         bar=bar,
-        breakable=breakable,
+        # A label may wrap where its words end: "Frozen|Lake8x8-|v1".
+        breakable=lambda label: Markup("<wbr>").join(_WORD_ENDS.split(label)),
     )
     return environment
 
@@ -106,25 +107,23 @@ def script_hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
-def page_frame(scripts: Sequence[str]) -> dict[str, str]:
-    """Styles, scripts, and their content security policy, for a page with figures."""
+def page_frame(
+    scripts: Sequence[str], styles: Sequence[str] = STYLES, is_plotted: bool = True
+) -> dict[str, str]:
+    """Styles, scripts, and their content security policy; of a page with figures also Plotly."""
     from plotly.offline import get_plotlyjs
 
-    early, start = template_file("theme.js"), template_file("start.js")
-    own, plotly = "\n".join(map(template_file, scripts)), get_plotlyjs()
+    early, own = template_file("theme.js"), "\n".join(map(template_file, scripts))
+    running = [early, own, *([template_file("start.js"), get_plotlyjs()] if is_plotted else [])]
     return {
-        "style": Markup("\n".join(map(template_file, STYLES))),  # noqa: S704  # our own
+        "style": Markup("\n".join(map(template_file, styles))),  # noqa: S704  # our own
+        "policy": " ".join(map(script_hash, running)),
         "early": inline_script(early),
-        "plotly": packed(plotly),
         "own": inline_script(own),
-        "start": inline_script(start),
-        "policy": " ".join(map(script_hash, [early, plotly, own, start])),
+        **(
+            {"start": inline_script(running[2]), "plotly": packed(running[3])} if is_plotted else {}
+        ),
     }
-
-
-def breakable(label: str) -> Markup:
-    """A label that may wrap where its words end: "Frozen|Lake8x8-|v1"."""
-    return Markup("<wbr>").join(_WORD_ENDS.split(label))
 
 
 def setting(value: Any) -> str:
@@ -181,10 +180,8 @@ def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
     first: dict[tuple[str, str], PlannedRun] = {}
     for run in analysis.results.finished:
         if not run.is_batch:
-            first.setdefault((run.agent, run.environment), run)
-    ranked = (
-        [(agent.agent, one.environment) for agent in one.agents] for one in analysis.environments
-    )
+            first.setdefault(run.labels, run)
+    ranked = [[(a.agent, one.environment) for a in one.agents] for one in analysis.environments]
     return [[first[name] for name in names if name in first] for names in ranked]
 
 

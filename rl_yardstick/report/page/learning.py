@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from numpy.typing import NDArray
 
 from rl_yardstick.envs.known_models import observations_of_states
@@ -60,11 +59,6 @@ def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
 
 def _count(number: int, word: str) -> str:
     return f"{number:,} {word}{'' if number == 1 else 's'}"
-
-
-# The page's data: the steps, the positions of states on a map, and the names of actions.
-#
-# Numbers keep all their digits, so the page shows what the agent computed.
 
 
 def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
@@ -166,7 +160,7 @@ def place_data(spec: TrainSpec, recorder: Watch) -> dict[str, Any]:
 
 
 def exactly(number: float) -> float | str | None:
-    """A number for JSON with all its digits; None for NaN, a word for infinity."""
+    """A number for JSON with all its digits, as the agent has it; NaN is None, infinity a word."""
     if math.isnan(number):
         return None
     if math.isinf(number):
@@ -181,8 +175,6 @@ def _layout_of(env: Any, n_states: int) -> GridLayout | None:
         return None
     return layout if np.array_equal(seen, np.arange(n_states)) else None
 
-
-# The page as one file: it needs nothing else and no network.
 
 MOST_BYTES = 2_900_000
 SCRIPTS = ("replay", "board", "readout", "curves", "steps", "maps", "player")
@@ -221,17 +213,12 @@ def _ever_less(recorder: Watch) -> Iterator[dict[str, Any]]:
 
 
 def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
-    early = frame.template_file("theme.js")
-    own = "\n".join(frame.template_file(f"learning/learning_{name}.js") for name in SCRIPTS)
-    style = f"{frame.template_file('page.css')}\n{frame.template_file('learning/learning.css')}"
+    data_text = frame.packed(frame.as_json(data, exactly))
+    scripts = [f"learning/learning_{name}.js" for name in SCRIPTS]
+    styles = ("page.css", "learning/learning.css")
     template = frame.templates("learning").get_template("learning.html")
     return template.render(
-        **words,
-        data=frame.packed(frame.as_json(data, exactly)),
-        style=Markup(style),  # noqa: S704  # our own
-        early=frame.inline_script(early),
-        own=frame.inline_script(own),
-        policy=" ".join(map(frame.script_hash, [early, own])),
+        **words, data=data_text, **frame.page_frame(scripts, styles, is_plotted=False)
     )
 
 
@@ -299,9 +286,8 @@ def _train_again(root: Path, planned: PlannedRun) -> None:
         run.begin(spec, {}, "")
         watch = train(spec, run).watch
         if _tensors(run.model_path(spec)) != _tensors(planned.run.model_path(spec)):
-            raise UserError(
-                "the agent came out differently than in the run: another version or processor?"
-            )
+            what = "the agent came out differently than in the run"
+            raise UserError(f"{what}: another version or processor?")
     assert watch is not None
     path.parent.mkdir(parents=True, exist_ok=True)
     words = write_learning_page(spec, watch, path, f"{planned.agent} on {planned.environment}")

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from rl_yardstick.experiments.analysis import EnvironmentAnalysis
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.pool import ERROR_FILE
 from rl_yardstick.experiments.results import StudyResults, mixed_versions
@@ -24,7 +24,6 @@ from rl_yardstick.report.series import (
     AgentRuns,
     Curve,
     EnvironmentSeries,
-    Grid,
     linear_up_to,
     mean_regret,
     with_best_mean,
@@ -89,25 +88,26 @@ def _compressed(values: Floats, linear: float | None) -> Floats:
 def verdict(report: Report) -> Section | None:
     """For each environment the lead, the pairs as a matrix or sentences, and the notes."""
     analysis, environments = report.analysis, report.series.environments
-    metric = METRIC_WORDS[analysis.study.metric]
+    study, metric = analysis.study, METRIC_WORDS[analysis.study.metric]
     cards = [
         {
             "environment": one.environment,
-            "conclusion": words.conclusion(analysis.study, one.environment),
+            "conclusion": words.conclusion(study, one.environment),
             "pairs": words.pairs_both_ways(one.environment.pairs),
             "has_sweeps": bool(one.sweeps),
             "grids": {
-                name: _grid(one.environment, grid, analysis.study.metric)
+                name: {
+                    "grid": grid,
+                    "best": with_best_mean(one.environment, *grid.labels),
+                    "shares": grid.shares(is_cost=study.metric in COSTS),
+                }
                 for name, grid in one.grids.items()
             },
         }
         for one in environments
     ]
     context = {
-        "general": [
-            *words.overall_sentences(analysis),
-            *words.places_without_a_run(analysis),
-        ],
+        "general": [*words.overall_sentences(analysis), *words.places_without_a_run(analysis)],
         "cards": cards,
         "unseen": words.unseen_sentence(analysis),
         "metric": metric,
@@ -120,47 +120,27 @@ def verdict(report: Report) -> Section | None:
 def _sweeps(one: EnvironmentSeries) -> dict[str, dict[str, Any]]:
     """By sweep, the means by parameter, and which of them are the best of all sweeps."""
     best = with_best_mean(one.environment, *(sweep.labels for sweep in one.sweeps.values()))
-    return {
-        group: {
-            **vars(sweep.means),
-            "parameter": sweep.parameter,
-            "best": [label in best for label in sweep.labels],
-        }
-        for group, sweep in one.sweeps.items()
-    }
-
-
-def _grid(environment: EnvironmentAnalysis, grid: Grid, metric: str) -> dict[str, Any]:
-    """The heat map of an agent: its rows of cells."""
-    best = with_best_mean(environment, *grid.labels)
-    shares = grid.shares(is_cost=metric in COSTS)
-    rows = [
-        [
-            {"mean": mean, "strength": f"{90 * share:.0f}%", "is_best": label in best}
-            for label, mean, share in zip(*of_row, strict=True)
-        ]
-        for of_row in zip(grid.labels, grid.means, shares, strict=True)
-    ]
-    return {"grid": grid, "n_best": len(best), "rows": list(zip(grid.down, rows, strict=True))}
+    found = {}
+    for group, sweep in one.sweeps.items():
+        marks = [label in best for label in sweep.labels]
+        found[group] = {**vars(sweep.means), "parameter": sweep.parameter, "best": marks}
+    return found
 
 
 def ranking(report: Report) -> Section | None:
-    """A table for each environment."""
-    study = report.analysis.study
-    tables = [_ranking(study, environment) for environment in report.analysis.environments]
+    """For each environment the ranking, other returns, and a sentence on changed training."""
+    study, tables = report.analysis.study, []
+    for environment in report.analysis.environments:
+        rows = [Row(agent, environment) for agent in environment.agents]
+        has_others = any(agent.stochastic or agent.discounted for agent in environment.agents)
+        table = {
+            **_table(study, [column for column in COLUMNS if column.page], rows),
+            "others": _table(study, OTHER_RETURNS, rows) if has_others else None,
+            "changes": words.on_changes([environment]),
+        }
+        tables.append(table)
     context = {"tables": tables, "metric": METRIC_WORDS[study.metric]}
     return Section("ranking", "Ranking", context, by_environment=True)
-
-
-def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, Any]:
-    """The ranking, the table of other returns below it, and a sentence on changed training."""
-    rows = [Row(agent, environment) for agent in environment.agents]
-    has_others = any(agent.stochastic or agent.discounted for agent in environment.agents)
-    return {
-        **_table(study, [column for column in COLUMNS if column.page], rows),
-        "others": _table(study, OTHER_RETURNS, rows) if has_others else None,
-        "changes": words.on_changes([environment]),
-    }
 
 
 def _table(study: StudySpec, columns: Sequence[Column], rows: Sequence[Row]) -> dict[str, Any]:
@@ -188,7 +168,6 @@ def curves(report: Report) -> Section | None:
     # For readers who cannot see the figure: the evaluations as a table.
     shown = [None if item is None else item["evaluation"] for item in curves]
     context = {
-        "has_curves": [item is not None for item in curves],
         "stages": STAGES,
         "units": ["step" if found is None else found.budget for found in shown],
         "tables": [
@@ -317,11 +296,8 @@ def _column(infos: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 
 def recorded(what: str, infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
     """Versions or parts of the machine by name, all distinct values joined."""
-    found: dict[str, set[str]] = {}
-    for info in infos:
-        for name, value in info[what].items():
-            found.setdefault(name, set()).add(value)
-    return {name: ", ".join(sorted(values)) for name, values in found.items()}
+    table = pd.DataFrame([info[what] for info in infos])
+    return {str(name): ", ".join(sorted(table[name].dropna().unique())) for name in table}
 
 
 def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
@@ -332,11 +308,9 @@ def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
     for run in results.planned:
         if run.path in there:
             continue
-        failure, error = results.failures.get(run.path), run.path / ERROR_FILE
-        details = read_text(error).strip() if failure and error.exists() else ""
-        reason = (
-            unreadable.get(run.path) or details.rpartition("\n")[2] or failure or "not done yet"
-        )
+        details, error = results.failures.get(run.path, ""), run.path / ERROR_FILE
+        details = (read_text(error) if details and error.exists() else details).strip()
+        reason = unreadable.get(run.path) or details.rpartition("\n")[2] or "not done yet"
         new = {"agent": run.agent, "environment": run.environment, "reason": reason, "seeds": []}
         group = groups.setdefault((run.agent, run.environment, reason), new)
         group["seeds"].append(run.seed)

@@ -45,11 +45,6 @@ class Trials:
         return table.assign(value=table["value"].astype(float).replace([np.inf, -np.inf], np.nan))
 
     @property
-    def is_cost(self) -> bool:
-        """Whether the lower figure is the better."""
-        return bool(self.record["lower_is_better"])
-
-    @property
     def judged(self) -> list[Mapping[str, Any]]:
         """The trials with a figure on at least one seed."""
         return [trial for trial in self.ended if trial["value"] is not None and trial["figures"]]
@@ -57,7 +52,7 @@ class Trials:
     @property
     def best_first(self) -> list[Mapping[str, Any]]:
         """The trials judged on all seeds, the best first, and then the others."""
-        sign = 1.0 if self.is_cost else -1.0
+        sign = 1.0 if self.record["lower_is_better"] else -1.0
 
         def rank(trial: Mapping[str, Any]) -> tuple[float, float]:
             # Those that have the optimum on all seeds go by their steps to it.
@@ -101,14 +96,13 @@ def importances(trials: Trials) -> dict[str, float]:
     if len({trial["value"] for trial in judged}) < 2 or not ranges:
         return {}
     directions = optuna.study.StudyDirection
-    direction = directions.MINIMIZE if trials.is_cost else directions.MAXIMIZE
+    direction = directions.MINIMIZE if trials.record["lower_is_better"] else directions.MAXIMIZE
     study = optuna.create_study(direction=direction, sampler=optuna.samplers.RandomSampler(0))
-    for trial in judged:
-        drawn = {name: ranges[name] for name in trial["params"] if name in ranges}
-        params = {name: trial["params"][name] for name in drawn}
-        study.add_trial(
-            optuna.create_trial(value=trial["value"], params=params, distributions=drawn)
-        )
+    for one in judged:
+        drawn = {name: ranges[name] for name in one["params"] if name in ranges}
+        params = {name: one["params"][name] for name in drawn}
+        trial = optuna.create_trial(value=one["value"], params=params, distributions=drawn)
+        study.add_trial(trial)
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
     with warnings.catch_warnings():
         # The warning is of parameters that few trials have; the page says that itself.
@@ -121,7 +115,6 @@ def importances(trials: Trials) -> dict[str, float]:
 _BELOW = 0.25
 # The number of groups of ranks, each drawn with its own opacity.
 _GROUPS = 5
-_ABSENT = object()
 
 
 def history(trials: Trials) -> dict[str, Any]:
@@ -129,16 +122,13 @@ def history(trials: Trials) -> dict[str, Any]:
     table = trials.table
     whole = table["value"].where(table["kind"] == COMPLETE)
     return {
-        "isCost": trials.is_cost,
+        "isCost": trials.record["lower_is_better"],
         "figure": trials.record["figure"],
         "edge": _edge(trials),
         "shipped": table["value"].get(0),
         "numbers": table.index,
-        "best": (whole.cummin() if trials.is_cost else whole.cummax()).ffill(),
-        "values": {
-            COMPLETE: whole,
-            PRUNED: table["value"].where(table["kind"] == PRUNED),
-        },
+        "best": (whole.cummin() if trials.record["lower_is_better"] else whole.cummax()).ffill(),
+        "values": {COMPLETE: whole, PRUNED: table["value"].where(table["kind"] == PRUNED)},
         "texts": [_text(trial) for trial in trials.ended],
         "failed": table.index[table["value"].isna()],
     }
@@ -156,7 +146,7 @@ def _edge(trials: Trials) -> float | None:
     It shows the best three quarters of the trials judged on all seeds, or else of all trials. It
     includes the shipped settings unless these would more than double it.
     """
-    sign = -1.0 if trials.is_cost else 1.0
+    sign = -1.0 if trials.record["lower_is_better"] else 1.0
     values = sign * trials.table["value"].dropna()
     for some in (values[trials.table["kind"] == COMPLETE], values):
         best, worst = some.max(), some.quantile(_BELOW)
@@ -171,29 +161,28 @@ def parallel(trials: Trials, shares: Mapping[str, float]) -> dict[str, Any]:
     """Each trial as a line through its parameters, the most important ones first."""
     ranges = trials.distributions
     names = [*shares, *(name for name in ranges if name not in shares)]
-    ranked = sorted(trials.judged, key=lambda t: t["value"], reverse=trials.is_cost)
-    return {
-        "axes": [{"name": name, "ticks": _ticks(ranges[name])} for name in names],
-        "lines": [
-            {
-                "number": trial["number"],
-                "group": min(_GROUPS - 1, rank * _GROUPS // len(ranked)),
-                "text": _text(trial),
-                "at": [_place(ranges[name], trial["params"].get(name, _ABSENT)) for name in names],
-                "said": [_said(trial["params"].get(name, _ABSENT)) for name in names],
-            }
-            for rank, trial in enumerate(ranked)
-        ],
-        "groups": _GROUPS,
-    }
+    is_cost = trials.record["lower_is_better"]
+    lines, ranked = [], sorted(trials.judged, key=lambda t: t["value"], reverse=is_cost)
+    for rank, trial in enumerate(ranked):
+        params = trial["params"]
+        line = {
+            "number": trial["number"],
+            "group": min(_GROUPS - 1, rank * _GROUPS // len(ranked)),
+            "text": _text(trial),
+            "at": [
+                _place(ranges[name], params[name]) if name in params else None for name in names
+            ],
+            "said": [_said(params[name]) if name in params else "not there" for name in names],
+        }
+        lines.append(line)
+    axes = [{"name": name, "ticks": _ticks(ranges[name])} for name in names]
+    return {"axes": axes, "lines": lines, "groups": _GROUPS}
 
 
-def _place(ends: BaseDistribution, value: Any) -> float | None:
-    """A value's position between the ends, from 0 to 1; None if the trial lacks the parameter."""
+def _place(ends: BaseDistribution, value: Any) -> float:
+    """A value's position between the ends, from 0 to 1."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-    if value is _ABSENT:
-        return None
     if isinstance(ends, CategoricalDistribution):
         return (ends.choices.index(value) + 0.5) / len(ends.choices)
     assert isinstance(ends, FloatDistribution | IntDistribution)
@@ -203,19 +192,23 @@ def _place(ends: BaseDistribution, value: Any) -> float | None:
     return 0.5 if low == high else (at - low) / (high - low)
 
 
-def _ticks(ends: Any) -> list[tuple[float | None, str]]:
+def _ticks(ends: Any) -> list[tuple[float, str]]:
     values = getattr(ends, "choices", None) or (ends.low, ends.high)
     return [(_place(ends, value), _said(value)) for value in values]
 
 
 def _said(value: Any) -> str:
-    if value is _ABSENT:
-        return "not there"
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return number(value) if is_number else setting(value)
 
 
 LEFT_OUT = "-"
+# The sections by template; those that are drawn are left out without data.
+SECTIONS = (
+    *(("verdict", "What was found"), ("history", "History"), ("parallel", "Settings tried")),
+    *(("importances", "What matters"), ("cost", "Cost"), ("trials", "All trials")),
+)
+DRAWN = ("parallel", "importances")
 
 
 def changes(trials: Trials, winner: int) -> list[tuple[str, str, str]]:
@@ -274,9 +267,13 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
     asked, retest = record["asked"] or {}, record["retest"]
     retested = {each["label"]: each for each in retest["settings"]} if retest else {}
     winner = retested.get(retest["winner"]) if retest else None
-    sections = _sections(trials, shares, winner)
     data: dict[str, Any] = {"page": {"agents": [], "environments": []}}
-    data |= {section.name: section.data for section in sections if section.data}
+    data["history"] = history(trials)
+    if trials.judged and asked:
+        lines = parallel(trials, shares)
+        data["parallel"] = {**lines, "winner": winner and winner["number"]}
+    if shares:
+        data["importances"] = {"names": [*shares], "shares": [*shares.values()]}
     place = asked.get("env", "an environment")
     place += f" ({record['map_name']})" if record.get("map_name") else ""
     template = frame.templates("tuning").get_template("tuning.html")
@@ -284,7 +281,7 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
         title=f"{asked.get('algo', 'an agent')} on {place}",
         record=record,
         asked=asked,
-        sections=sections,
+        sections=[Section(*one) for one in SECTIONS if one[0] in data or one[0] not in DRAWN],
         retest=retest,
         retest_page=retest_page,
         winner=winner,
@@ -299,20 +296,3 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
         **frame.page_frame([*frame.SHARED, "tuning/tuning.js", "paper.js"]),
     )
     write_text(path, text)
-
-
-def _sections(
-    trials: Trials, shares: Mapping[str, float], winner: Mapping[str, Any] | None
-) -> list[Section]:
-    """The sections of the page, with the data of their figures."""
-    sections = [
-        Section("verdict", "What was found"),
-        Section("history", "History", data=history(trials)),
-    ]
-    if trials.judged and trials.record["asked"]:
-        lines = {**parallel(trials, shares), "winner": winner and winner["number"]}
-        sections.append(Section("parallel", "Settings tried", data=lines))
-    if shares:
-        bars = {"names": [*shares], "shares": [*shares.values()]}
-        sections.append(Section("importances", "What matters", data=bars))
-    return [*sections, Section("cost", "Cost"), Section("trials", "All trials")]

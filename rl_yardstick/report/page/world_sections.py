@@ -29,7 +29,6 @@ from rl_yardstick.report.series import (
     Curve,
     Pulls,
     PullSeries,
-    astype,
     mean_of,
     mean_regret,
     regret_of_runs,
@@ -47,8 +46,7 @@ def bandits(report: Report) -> Section | None:
         return None
     pulls = [{} if series is None else series.pulls for series in bandits]
     context = {
-        "is_bandit": [series is not None for series in bandits],
-        "tables": [context_tables(of_agents) for of_agents in pulls],
+        "tables": [_by_arm(of_agents) for of_agents in pulls],
         "agents": [list(of_agents) for of_agents in pulls],
         "spread": SPREAD,
         "has_bounds": any(series is not None and series.bounds for series in bandits),
@@ -57,31 +55,16 @@ def bandits(report: Report) -> Section | None:
     return Section("bandits", "Pulls and regret", context, places=data, by_environment=True)
 
 
-def context_tables(pulls: Pulls) -> list[dict[str, Any]]:
-    """Shares of the pulls by context; empty if true means differ between runs."""
-    known = {agent: p for agent, p in pulls.items() if p.true_means.size}
-    means = next((p.true_means for p in known.values()), np.empty(0))
+def _by_arm(pulls: Pulls) -> dict[str, Any] | None:
+    """Means, regret and shares of the pulls by context and arm; None if means differ by run."""
+    shares = {agent: p.shares for agent, p in pulls.items() if p.true_means.size}
+    means = next((p.true_means for p in pulls.values() if p.true_means.size), np.empty(0))
     if not 0 < means.size <= MOST_ARMS:
-        return []
+        return None
     gaps = means.max(axis=1, keepdims=True) - means
-    n_contexts, n_arms = means.shape
-    return [
-        {
-            "name": f"context {context}" if n_contexts > 1 else "",
-            "rows": [
-                {
-                    "name": f"arm {arm}",
-                    "mean": means[context, arm],
-                    "regret": gaps[context, arm],
-                    # NaN where an agent never saw the context.
-                    "shares": {agent: p.shares[context, arm] for agent, p in known.items()},
-                }
-                for arm in range(n_arms)
-            ],
-            "regrets": {agent: p.shares[context] @ gaps[context] for agent, p in known.items()},
-        }
-        for context in range(n_contexts)
-    ]
+    # NaN where an agent never saw the context.
+    regrets = {agent: (share * gaps).sum(axis=1) for agent, share in shares.items()}
+    return {"means": means, "gaps": gaps, "shares": shares, "regrets": regrets}
 
 
 def _bandit_data(series: PullSeries) -> dict[str, Any]:
@@ -93,10 +76,7 @@ def _bandit_data(series: PullSeries) -> dict[str, Any]:
                 "x": pulls.pulls,
                 "reward": pulls.reward,
                 "optimal": pulls.optimal,
-                "regret": {
-                    "mean": mean_regret(pulls),
-                    "runs": regret_of_runs(pulls),
-                },
+                "regret": {"mean": mean_regret(pulls), "runs": regret_of_runs(pulls)},
                 "simple": pulls.simple_regret,
             }
             for agent, pulls in series.pulls.items()
@@ -142,10 +122,8 @@ def diagnosis(report: Report) -> Section | None:
     data = [_compared(analysis, environment) or None for environment in analysis.environments]
     if not any(data):
         return None
-    context = {"is_there": [item is not None for item in data]}
-    return Section(
-        "diagnosis", "Critics and gradients", context, MEANINGS, data, by_environment=True
-    )
+    title = "Critics and gradients"
+    return Section("diagnosis", title, data=MEANINGS, places=data, by_environment=True)
 
 
 def _compared(
@@ -184,8 +162,7 @@ def policies(report: Report) -> Section | None:
     data = [_policy_data(analysis, environment, room) for environment in analysis.environments]
     if not any(data):
         return None
-    context = {"is_drawn": [item is not None for item in data]}
-    return Section("policies", "Policies", context, places=data, by_environment=True)
+    return Section("policies", "Policies", places=data, by_environment=True)
 
 
 def _policy_data(
@@ -254,7 +231,7 @@ def _read_maps(
 
 def _digits(numbers: NDArray[Any]) -> str:
     """Numbers below ten as one text, which is shortest."""
-    return "".join(map(str, astype(np.int64).tolist()))
+    return "".join(map(str, numbers.astype(np.int64).tolist()))
 
 
 MOST_FILMED = 8  # agents of an environment, the best of them
