@@ -1,8 +1,7 @@
-"""``yardstick inspect``: the content of a model file, read without running any of it."""  # noqa: A005
+"""``yardstick inspect``: the content of a model file, read without running any of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from rl_yardstick.commands.cli import OneLineParser
@@ -21,25 +20,19 @@ def main() -> int:
     path = Path(parser.parse_args().model)
 
     from rl_yardstick.commands.terminal import say, table_console
-    from rl_yardstick.safe_files import inspect_model
+    from rl_yardstick.safe_files.models import inspect_model
 
     try:
-        report = inspect_model(path)
+        found = inspect_model(path)
     except FileNotFoundError:
         raise UserError(f"no such model file: {path}") from None
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is no model: {one_line(error)}") from error
-    found: dict[str, Mapping[str, str]] = {
-        "members": {name: f"{size:,} bytes" for name, size in report.sizes.items()},
-        "weights": {name: str(shape) for name, shape in report.weights.items()},
-        "settings": report.settings,
-        "suspicious": dict.fromkeys(report.suspicious, ""),
-    }
-    if not report.suspicious:
-        found["nothing in it is suspicious"] = found.pop("suspicious")
+    suspicious = found.pop("suspicious")
+    found["suspicious" if suspicious else "nothing in it is suspicious"] = suspicious
     console = table_console()
     for title, lines in found.items():
         width = max(map(len, lines), default=0)
         rows = [f"  {name:<{width}}  {text}".rstrip() for name, text in lines.items()]
         say(console, "\n".join([title, *rows]))
-    return SUSPICIOUS if report.suspicious else 0
+    return SUSPICIOUS if suspicious else 0

@@ -90,7 +90,7 @@ def read_arrays(
     found: dict[str, NDArray[Any]] = {}
     lengths: dict[str, int] = {}
     try:
-        members = read_members(read_bytes(path, MAX_ARRAYS), most=100)
+        members = read_members(read_bytes(path, MAX_ARRAYS))
         for name, axes in shapes.items():
             if name in optional and f"{name}.npy" not in members:
                 continue

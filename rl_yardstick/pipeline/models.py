@@ -299,7 +299,7 @@ def load(spec: TrainSpec, path: Path, env: VecEnv | None, **replaced: Any) -> Ba
     Raises:
         UserError: if it is no agent of this kind.
     """
-    from rl_yardstick.safe_files import load_model
+    from rl_yardstick.safe_files.models import load_model
 
     algorithm: Any = load_algorithm(spec.algo)
     content = io.BytesIO(read_bytes(path, MAX_MODEL))
@@ -442,7 +442,7 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
 
 def _load_replay_buffer(agent: Any, path: Path) -> None:
     from rl_yardstick.agents.library import MaskedReplayBuffer
-    from rl_yardstick.safe_files import load_replay_buffer
+    from rl_yardstick.safe_files.buffers_and_statistics import load_replay_buffer
 
     wanted = agent.replay_buffer
     content = io.BytesIO(read_bytes(path, MAX_MODEL))
