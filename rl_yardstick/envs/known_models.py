@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import replace
 from typing import Any
 
@@ -58,7 +57,7 @@ OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservat
 Judgement = tuple[Claim | None, ModelCheck | None]
 
 # A cache of judgements of environments, by `id`: set only while these live.
-_looked_at: ContextVar[dict[int, Judgement] | None] = ContextVar("looked_at", default=None)
+_looked_at: dict[int, Judgement] = {}
 
 
 def transition_model(env: Env) -> TransitionModel | None:
@@ -72,8 +71,8 @@ def transition_model(env: Env) -> TransitionModel | None:
     where it gives its reward at terminations only. A time limit is no part of the model: see
     `time_limit`. None where the model is not known.
     """
-    base, wrappers = _layers(env)
-    claim = _believed(base) if all(map(_folds, wrappers)) else None
+    _, wrappers = _layers(env)
+    claim = _believed(env)
     if claim is None:
         return None
     model = claim.model
@@ -124,8 +123,7 @@ def success_outcomes(env: Env) -> Bools | None:
     of FrozenLake and CliffWalking, the passenger delivered in Taxi. In Blackjack it is any win.
     None where the model is not known or no episode terminates.
     """
-    base, wrappers = _layers(env)
-    claim = _believed(base) if all(map(_folds, wrappers)) else None
+    base, claim = env.unwrapped, _believed(env)
     if claim is None:
         return None
     model = claim.model
@@ -145,16 +143,11 @@ def success_outcomes(env: Env) -> Bools | None:
 
 def observations_of_states(env: Env) -> NDArray[Any] | None:
     """The observation of each state of `transition_model`; None where it is not known."""
-    base, wrappers = _layers(env)
-    claim = _believed(base)
-    if claim is None or claim.observations is None:
-        return None
-    observations = claim.observations
-    for wrapper in wrappers:
-        if isinstance(wrapper, OBSERVATION_WRAPPERS):
+    claim = _believed(env)
+    observations = None if claim is None else claim.observations
+    for wrapper in _layers(env)[1]:
+        if observations is not None and isinstance(wrapper, OBSERVATION_WRAPPERS):
             observations = wrapper.map_observations(observations)
-        elif not _folds(wrapper):
-            return None
     return observations
 
 
@@ -203,8 +196,11 @@ def _folds(wrapper: Wrapper) -> bool:
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
 
 
-def _believed(base: Env) -> Claim | None:
-    """The environment's claim about its dynamics, if it is accepted."""
+def _believed(env: Env) -> Claim | None:
+    """The environment's claim about its dynamics, if it is accepted and no wrapper hides it."""
+    base, wrappers = _layers(env)
+    if not all(map(_folds, wrappers)):
+        return None
     claim, check = _judged(base)
     return claim if check is not None and check.refusal is None else None
 
@@ -212,18 +208,18 @@ def _believed(base: Env) -> Claim | None:
 @contextmanager
 def one_look(env: Env) -> Iterator[None]:
     """Cache the model of ``env``, which must not change within the ``with`` statement."""
-    token = _looked_at.set({id(env.unwrapped): _judged(env.unwrapped)})
+    base = env.unwrapped
+    _looked_at[id(base)] = _judged(base)
     try:
         yield
     finally:
-        _looked_at.reset(token)
+        _looked_at.pop(id(base), None)
 
 
 def _judged(base: Env) -> Judgement:
     """The environment's claim about its dynamics, and the result of its check."""
-    known = _looked_at.get()
-    if known is not None and id(base) in known:
-        return known[id(base)]
+    if id(base) in _looked_at:
+        return _looked_at[id(base)]
     try:
         claim = claim_of(base)
     except ValueError as error:
