@@ -35,9 +35,9 @@ def engine_outlook(
     """The outlook of an agent; None if it has no compiled networks."""
     if spec.algo not in NETWORKS or agent.env is None:
         return None
+    from rl_yardstick.agents.compiled.env_states import observed_world
     from rl_yardstick.agents.compiled.worlds import NotCompilable
     from rl_yardstick.agents.networks.engine_setting import CompiledNetworks
-    from rl_yardstick.agents.compiled.env_states import observed_world
 
     if not isinstance(agent, CompiledNetworks):
         return None

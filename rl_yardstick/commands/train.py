@@ -364,7 +364,10 @@ def schedule_in_words(value: object) -> str:
     if not (isinstance(value, str) and value.startswith(("lin_", "exp_"))):
         return ""
     kind, *numbers = value.split("_")
-    start, end = [*map(float, numbers), 0.0][:2]
+    try:
+        start, end = [*map(float, numbers), 0.0][:2]
+    except ValueError:  # the agent's constructor tells
+        return ""
     how = "linearly" if kind == "lin" else "exponentially"
     return f"{'falls' if end < start else 'rises'} {how} from {start:g} to {end:g}"
 

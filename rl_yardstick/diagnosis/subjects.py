@@ -29,7 +29,7 @@ from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.arguments import arguments_of, check_arguments, constructor_parameters
 from rl_yardstick.pipeline.components import constructor_arguments
 from rl_yardstick.pipeline.errors import UserError, one_line, unknown
-from rl_yardstick.pipeline.settings import validated
+from rl_yardstick.pipeline.spec import validated
 
 if TYPE_CHECKING:
     from stable_baselines3.common.callbacks import BaseCallback

@@ -20,7 +20,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec, validated
 
 STEPS_PER_PAIR, FEWEST_PAIRS = 2500, 100  # training steps per state and action
 VISITS_AVERAGED = 10  # a step size of 1 / n averages over about the last n visits
@@ -35,8 +35,6 @@ def resolved(fields: dict[str, Any]) -> TrainSpec:
     Raises:
         UserError: where an automatic value does not exist.
     """
-    from rl_yardstick.pipeline.settings import validated
-
     algorithm, steps = dict(fields["algorithm"]), fields.get("n_timesteps")
     asked = [key for key in OF_TABLES if algorithm.get(key) == "auto"]
     is_auto = isinstance(steps, str) and steps.startswith("auto")

@@ -16,7 +16,7 @@ from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs.wrappers import ActionMasks, has_masks
 from rl_yardstick.pipeline.components import build
 from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
-from rl_yardstick.pipeline.modules import import_modules
+from rl_yardstick.pipeline.modules import import_modules, split_id
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # The time limit of evaluations if neither environment nor settings have one: a greedy policy that
@@ -33,6 +33,9 @@ Env = gym.Env[Any, Any]
 
 def check_env_id(env_id: str) -> None:
     """Raise UserError if no such environment is registered."""
+    module, name = split_id(env_id)
+    if module:
+        raise UserError(f"{env_id}: name it {name}, and add --gym-packages {module}")
     if env_id not in gym.registry:
         raise unknown("unknown environment", env_id, gym.registry, n=3)
 

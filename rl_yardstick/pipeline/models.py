@@ -29,9 +29,8 @@ from rl_yardstick.pipeline.settings import (
     components,
     read_entry,
     read_saved,
-    validated,
 )
-from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec, validated
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import ValidationError
 
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.pipeline.arguments import arguments_of, check_arguments, check_keywords
@@ -309,17 +308,6 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
         special["normalize"].setdefault("gamma", algorithm["gamma"])
     found = {"algo": algo, "env_id": env_id, "algorithm": algorithm, **special, **fields}
     return resolved(found)
-
-
-def validated(found: Mapping[str, Any]) -> TrainSpec:
-    """The spec with these fields; mistakes in one line."""
-    try:
-        return TrainSpec.model_validate(found)
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(map(str, first["loc"]))
-        reason = first["msg"][0].lower() + first["msg"][1:]
-        raise UserError(f"{name}: {reason}, not {shown(first['input'])}") from None
 
 
 def components(value: Any, where: str) -> list[dict[str, Any]]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
+from rl_yardstick.pipeline.errors import UserError, shown
 from rl_yardstick.pipeline.files import portable_name
 
 UNBOUNDED = 10**12  # steps, where episodes are counted
@@ -100,3 +102,14 @@ class TrainSpec(BaseModel):
     def changed(self, **fields: Any) -> TrainSpec:
         """A copy with other values; they are not checked again."""
         return self.model_copy(update=fields)
+
+
+def validated(found: Mapping[str, Any]) -> TrainSpec:
+    """The spec with these fields; mistakes in one line."""
+    try:
+        return TrainSpec.model_validate(found)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(map(str, first["loc"]))
+        reason = first["msg"][0].lower() + first["msg"][1:]
+        raise UserError(f"{name}: {reason}, not {shown(first['input'])}") from None

@@ -54,6 +54,7 @@ from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.pipeline.watching import EvaluationMaps, Watch, watch_of
 
 # What libraries raise for settings that they cannot work with.
+REFUSALS = (ValueError, TypeError, AssertionError, RuntimeError, MemoryError)  # of constructors
 OF_LIBRARIES = (
     *(ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError),
 )
@@ -357,8 +358,10 @@ def make_agent(spec: TrainSpec, folder: Path | None, appending: bool = False) ->
             agent = load_to_train(spec, env, device=spec.device, **common, **arguments)
         else:
             agent = _constructed(algorithm, env, {"device": spec.device, **common}, arguments)
-    except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:
+    except BaseException as error:
         env.close()
+        if isinstance(error, UserError) or not isinstance(error, REFUSALS):
+            raise
         raise UserError(f"{spec.algo} on {spec.place}: {one_line(error)}") from error
     if not (spec.tensorboard_log or spec.library_log):
         agent.set_logger(Logger(folder=None, output_formats=[]))

@@ -9,13 +9,13 @@ from types import SimpleNamespace
 
 import pytest
 from optuna.storages import InMemoryStorage
+from rl_yardstick.tuning.trial_storage import TrialQueue, open_storage, open_study
 
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.tuning import searching
 from rl_yardstick.tuning.search_spaces import read_search_space
 from rl_yardstick.tuning.searching import OpenTuning, RunOutcome, Search
 from rl_yardstick.tuning.suggesting import Suggestions, make_sampler
-from rl_yardstick.tuning.trial_storage import TrialQueue, open_storage, open_study
 from rl_yardstick.tuning.tuning_spec import SHIPPED, TuningSpec
 
 SHIPPED_ENTRY = {"learning_rate": 0.5, "gamma": 0.9, "n_episodes": 10}

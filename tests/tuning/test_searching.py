@@ -11,6 +11,7 @@ import optuna
 import pandas as pd
 import pytest
 from rl_yardstick.pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
+from rl_yardstick.tuning.trial_storage import FAILURE, FIGURES, SETTINGS
 
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.growing import looked
@@ -38,7 +39,6 @@ from rl_yardstick.tuning.retesting import (
     write_winner,
 )
 from rl_yardstick.tuning.searching import RunOutcome, outcome_of
-from rl_yardstick.tuning.trial_storage import FAILURE, FIGURES, SETTINGS
 from rl_yardstick.tuning.tuning_spec import judged
 from rl_yardstick.verdicts import Estimate
 

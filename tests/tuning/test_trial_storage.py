@@ -1,11 +1,11 @@
 """Where trials are kept, as --storage says it, and drivers that share them."""
 
 import pytest
+from rl_yardstick.tuning.trial_storage import open_storage
 
 from rl_yardstick.pipeline import locks
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.tuning import trial_storage
-from rl_yardstick.tuning.trial_storage import open_storage
 from rl_yardstick.tuning.tuning_spec import failing_in_a_line, kind_of, without_secret
 
 
