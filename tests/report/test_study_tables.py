@@ -87,27 +87,19 @@ def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_foo
     assert not any("†" in said for said in conclusion(found.study, other).everything)
 
 
-SAFE = [
-    (
-        documents.latex_text,
-        r"\input{x} $a^b$",
-        r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$",
-    ),
-    (documents.latex_text, "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
-    (documents.latex_text, "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
-    (documents.latex_text, "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
-    (
-        documents.markdown_text,
-        "a|b <b>*x*</b> [x](y) `c`",
-        "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`",
-    ),
-    (documents.name_of, "a`b|", "a\\`b\\|"),
-]
-
-
-def test_nothing_of_a_text_is_markup():
-    for escaped, text, safe in SAFE:
-        assert escaped(text) == safe
+@pytest.mark.parametrize(
+    ("form", "text", "safe"),
+    [
+        ("latex_text", r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
+        ("latex_text", "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
+        ("latex_text", "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
+        ("latex_text", "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
+        ("markdown_text", "a|b <b>*x*</b> [x](y) `c`", r"a\|b \<b\>\*x\*\</b\> [x\](y) \`c\`"),
+        ("name_of", "a`b|", r"a\`b\|"),
+    ],
+)
+def test_nothing_of_a_text_is_markup(form, text, safe):
+    assert getattr(documents, form)(text) == safe
 
 
 def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
