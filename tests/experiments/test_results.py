@@ -21,11 +21,11 @@ from rl_yardstick.experiments.results import (
 )
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline.run import FINISHED
-from rl_yardstick.report.words import places_without_a_run
 from rl_yardstick.report.documents import write_tables
 from rl_yardstick.report.figures import write_figures
 from rl_yardstick.report.series import episodes_table, study_series
 from rl_yardstick.report.terminal import print_analysis, print_episodes_table
+from rl_yardstick.report.words import places_without_a_run
 
 HOUSE = EnvironmentSpec("Warehouse-v0", "Warehouse-v0", {"n_timesteps": 100})
 POLE = EnvironmentSpec("CartPole-v1", "CartPole-v1", {"n_timesteps": 100})
