@@ -182,23 +182,16 @@ class Job:
 @contextmanager
 def held(root: Path) -> Iterator[None]:
     """Hold a study's folder; it is removed again if nothing comes of it."""
-    from filelock import FileLock, Timeout
+    from rl_yardstick.pipeline.run import LOCK, Run
 
     root.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(root / ".lock", timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise UserError(f"{root} is in use by another command") from None
-    except NotImplementedError as error:  # no flock
-        raise UserError(f"{root}: {error}") from error
-    try:
-        yield
-    finally:
-        if [path.name for path in root.iterdir()] == [".lock"]:
-            (root / ".lock").unlink()
-            root.rmdir()
-        lock.release()
+    with Run(root):  # with the lock of a run's folder
+        try:
+            yield
+        finally:
+            if [path.name for path in root.iterdir()] == [LOCK]:
+                (root / LOCK).unlink()
+                root.rmdir()
 
 
 def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> Workers:
@@ -250,9 +243,11 @@ def check_settings_kept(job: Job, planned: Sequence[PlannedRun], replaces: bool)
     if not others:
         return
     if not replaces:
-        named = {key: f"{key}: {shown(was)} there, {shown(now)} now"
-                 for _, settings in others for key, (was, now) in settings.items()}  # fmt: skip
-        words = "; ".join(list(named.values())[:3]) + ("; ..." if len(named) > 3 else "")
+        found = {key: pair for _, settings in others for key, pair in settings.items()}
+        named = [
+            f"{key}: {shown(was)} there, {shown(now)} now" for key, (was, now) in found.items()
+        ]
+        words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
         runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
         raise UserError(
             f"{job.root}: {runs} other settings ({words}): --name NAME makes another study of it, "

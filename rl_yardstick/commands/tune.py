@@ -8,9 +8,11 @@ import math
 import shlex
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -50,14 +52,15 @@ from rl_yardstick.tuning.tuning_spec import (
 )
 
 if TYPE_CHECKING:
-    from rl_yardstick.tuning.retesting import Candidate, Outcome
+    from optuna.trial import FrozenTrial
+
+    from rl_yardstick.tuning.retesting import Outcome
     from rl_yardstick.tuning.searching import Search
 
 # --- flags ----------------------------------------------------------------------------------------
 
-TRIALS = whole_number(1, 100_000)
-SEEDS = whole_number(1, 1000)
-FIRST_SEED = whole_number(0, 2**31)
+SEEDS: Mapping[str, Any] = {"type": whole_number(1, 1000), "metavar": "N"}
+FIRST_SEED: Mapping[str, Any] = {"type": whole_number(0, 2**31), "metavar": "N"}
 SECONDS_BETWEEN_LINES = 10.0
 
 EPILOG = """\
@@ -78,51 +81,16 @@ def build_parser() -> argparse.ArgumentParser:
         "run the best again on other seeds, and save a setting that is better there.",
         epilog=EPILOG,
     )
-    add = parser.add_argument
-    add("--algo", required=True, metavar="AGENT", help="agent (train --list has them)")
-    add("--env", required=True, metavar="ID", help="environment")
-
-    add = parser.add_argument_group("search").add_argument
-    names = ("--trials", "--n-trials", "--max-total-trials")
-    number = {"type": TRIALS, "default": 100, "metavar": "N"}
-    add(*names, dest="n_trials", **number, help="settings to try (100)")
-    number = {"type": SEEDS, "metavar": "N"}
-    add("--seeds-per-trial", **number, default=5, help="seeds of each trial (5)")
-    first = {"type": FIRST_SEED, "metavar": "N", "help": "the first of these seeds (%(default)s)"}
-    add("--first-seed", default=0, **first)
-    statistic = "which figure of a trial's runs counts: mean (default), interquartile mean, or "
-    statistic += "lower quartile"
-    add("--objective", choices=OBJECTIVES, default="mean", help=statistic)
-    figure = "which figure of a run counts (default: score, the final policy's return between the "
-    figure += "best random or constant policy, 0, and the optimum, 1; the return if no optimum is "
-    figure += "known; on bandits regret); steps and seconds count until the threshold"
-    add("--metric", choices=FIGURES, help=figure)
-    add("--threshold", type=float, metavar="RETURN", help="the return that counts as solved")
-    add("--sampler", choices=SAMPLERS, default="tpe", help="what suggests settings (tpe)")
-    pruned = "rule that ends hopeless trials (auto)"
-    add("--pruner", choices=tuple(PRUNERS), default="auto", help=pruned)
-    random = "trials at random before the sampler learns from them (10)"
-    count = whole_number(0, 100_000)
-    add("--n-startup-trials", type=count, default=10, metavar="N", help=random)
-    space = "the values to choose from (default: hyperparams/search_spaces/AGENT.yml)"
-    add("--search-space", type=Path, metavar="YAML", help=space)
-    add("--seed", type=whole_number(0, 2**32 - 1), default=0, help="seed of the search (0)")
-    timeout = "begin no more runs after this time, e.g. 50m; then comes the re-test"
-    add("--timeout", type=seconds, default=math.inf, metavar="TIME", help=timeout)
-
-    add = parser.add_argument_group("re-test").add_argument
-    again = "run the best K settings and the shipped ones again on other seeds (3; 0 for none)"
-    add("--retest", type=whole_number(0, 100), default=3, metavar="K", help=again)
-    add("--retest-seeds", **number, default=20, help="how many other seeds (20)")
-    add("--first-retest-seed", default=1000, **first)
-    decided = "add seeds, at looks fixed beforehand, until the best setting is decided to be better"
-    add("--until-decided", action="store_true", help=decided)
-    add("--max-retest-seeds", **number, help="the most other seeds for that (80)")
+    parser.add_argument("--algo", required=True, metavar="AGENT", help="train --list has them")
+    parser.add_argument("--env", required=True, metavar="ID", help="environment")
+    _add_search(parser.add_argument_group("search").add_argument)
+    _add_retest(parser.add_argument_group("re-test").add_argument)
 
     group = parser.add_argument_group("runs")
     add_shared(group, "--n-timesteps", "--n-episodes")
-    fixed = "hyperparameters of every trial, which are not searched, e.g. gamma:0.99"
-    add_shared(group, "--hyperparams", help=fixed)
+    add_shared(
+        group, "--hyperparams", help="hyperparameters of every trial, which are not searched"
+    )
     add_shared(group, "--engine")
     add_shared(group, "--conf-file", help="start from another file's entry")
     add_shared(group, "--env-kwargs", "--gym-packages")
@@ -132,23 +100,54 @@ def build_parser() -> argparse.ArgumentParser:
     add("--eval-episodes", type=COUNT, default=20, metavar="N", help=episodes)
     add_shared(group, "--jobs", "--cluster", "--run-timeout")
 
-    group = parser.add_argument_group("output")
-    add = group.add_argument
-    storage = "storage of the trials: a file (a journal), sqlite:///FILE, postgresql://... "
-    storage += "(default: trials.db in the search's folder)"
+    add = parser.add_argument_group("output").add_argument
+    storage = "database of the trials: sqlite:///FILE, postgresql://... (default: in the folder)"
     add("--storage", type=filled, metavar="WHERE", help=storage)
     name = "name of the search and its folder (default: ENV_AGENT)"
-    add("--name", "--study-name", dest="name", type=folder_name, help=name)
+    add("--name", "--study-name", type=folder_name, help=name)
     names = ("-f", "--log-folder", "--optimization-log-path")
-    folder = "folder of all searches (logs/tuning)"
-    add(*names, dest="log_folder", type=filled, default="logs/tuning", help=folder)
-    names = ("--no-report", "--no-optim-plots")
-    no_page = "only tables: no figures and no page"
-    add(*names, dest="no_report", action="store_true", help=no_page)
+    add(*names, type=filled, default="logs/tuning", help="folder of all searches (logs/tuning)")
+    tables = "only tables: no figures and no page"
+    add("--no-report", "--no-optim-plots", action="store_true", help=tables)
     # Users of rl_zoo3 type it; this command always does what it asks for.
-    names = ("-optimize", "--optimize-hyperparameters")
-    add(*names, action="store_true", help=argparse.SUPPRESS)
+    add("-optimize", "--optimize-hyperparameters", action="store_true", help=argparse.SUPPRESS)
     return parser
+
+
+def _add_search(add: Callable[..., Any]) -> None:
+    trials: dict[str, Any] = {"dest": "n_trials", "type": whole_number(1, 100_000), "metavar": "N"}
+    names = ("--trials", "--n-trials", "--max-total-trials")
+    add(*names, **trials, default=100, help="settings to try (100)")
+    add("--seeds-per-trial", **SEEDS, default=5, help="seeds of each trial (5)")
+    add("--first-seed", **FIRST_SEED, default=0, help="the first of these seeds (0)")
+    statistic = "the value of a trial by its runs: mean (default), interquartile mean, or lower "
+    statistic += "quartile"
+    add("--objective", choices=OBJECTIVES, default="mean", help=statistic)
+    figure = "which figure of a run counts (default: score, the final policy's return between the "
+    figure += "best random or constant policy, 0, and the optimum, 1; the return if no optimum is "
+    figure += "known; on bandits regret); steps and seconds count until the threshold"
+    add("--metric", choices=FIGURES, help=figure)
+    add("--threshold", type=float, metavar="RETURN", help="the return that counts as solved")
+    add("--sampler", choices=SAMPLERS, default="tpe", help="what suggests settings (tpe)")
+    pruned = "rule that ends hopeless trials (auto)"
+    add("--pruner", choices=tuple(PRUNERS), default="auto", help=pruned)
+    drawn, count = "random trials before the sampler learns (10)", whole_number(0, 100_000)
+    add("--n-startup-trials", type=count, default=10, metavar="N", help=drawn)
+    space = "the values to choose from (default: hyperparams/search_spaces/AGENT.yml)"
+    add("--search-space", type=Path, metavar="YAML", help=space)
+    add("--seed", type=whole_number(0, 2**32 - 1), default=0, help="seed of the search (0)")
+    timeout = "begin no more runs after this time, e.g. 50m; then comes the re-test"
+    add("--timeout", type=seconds, default=math.inf, metavar="TIME", help=timeout)
+
+
+def _add_retest(add: Callable[..., Any]) -> None:
+    again = "run the best K settings and the shipped ones again on other seeds (3; 0 for none)"
+    add("--retest", type=whole_number(0, 100), default=3, metavar="K", help=again)
+    add("--retest-seeds", **SEEDS, default=20, help="how many other seeds (20)")
+    add("--first-retest-seed", **FIRST_SEED, default=1000, help="the first of these (1000)")
+    decided = "add seeds, at looks fixed beforehand, until the best setting is decided to be better"
+    add("--until-decided", action="store_true", help=decided)
+    add("--max-retest-seeds", **SEEDS, help="the most other seeds for that (80)")
 
 
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:
@@ -207,7 +206,7 @@ def main() -> int:
 
     stop, deadline = Stop().listen(), time.monotonic() + args.timeout
     module, args.env = split_id(args.env)
-    args.gym_packages += [module] if module else []
+    args.gym_packages = [*args.gym_packages, *filter(None, [module])]
     import_modules(args.gym_packages)
     tuning = tuning_spec(args)
     root = Path(args.log_folder) / tuning.study.name
@@ -233,13 +232,11 @@ def main() -> int:
 def do_trials(job: Job, search: Search, deadline: float) -> None:
     """Do trials until there are enough; begin no run after ``deadline`` (`time.monotonic`)."""
     from rl_yardstick.experiments.pool import keep_busy
-    from rl_yardstick.tuning.searching import Trials
 
-    if search.is_done:
-        return
-    with TuningProgress(job.console, search) as progress:
-        trials = Trials(search, progress.trial_ended, deadline)
-        keep_busy(job.workers, trials.next_run, trials.ended, job.command, job.stop)
+    search.deadline = deadline
+    if not search.is_done:
+        with progress(job.console, search) as search.tell:
+            keep_busy(job.workers, search.next_run, search.ended, job.command, job.stop)
 
 
 def do_retest(job: Job, search: Search) -> int:
@@ -248,8 +245,8 @@ def do_retest(job: Job, search: Search) -> int:
 
     tuning, console = search.tuning, job.console
     ranked = best_trials(tuning, search.trials)
-    candidates = chosen_for_retest(tuning, ranked)
-    if not candidates:
+    chosen = chosen_for_retest(tuning, ranked)
+    if not chosen:
         if tuning.retest:
             which = "no settings but the shipped ones" if ranked else "no settings"
             why = f"{which} were judged to the end"
@@ -258,14 +255,14 @@ def do_retest(job: Job, search: Search) -> int:
             say(console, f"{why}: no re-test")
         write_down(job, search, None)
         return 0 if ranked or not search.is_done else 1
-    code, outcome = retested(job, search, ranked, candidates)
+    code, outcome = retested(job, search, ranked, chosen)
     print_outcome(console, outcome)
     winner = outcome.winner
     if winner is None:
         (search.root / WINNER).unlink(missing_ok=True)  # from before the search continued
         write_down(job, search, outcome)
         return code
-    entry = next(each.entry for each in candidates if each.number == winner.number)
+    entry = search.trials[winner.number].user_attrs["settings"]
     path = write_winner(search, outcome, entry)
     write_down(job, search, outcome)
     words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id, "--conf-file"]
@@ -281,7 +278,7 @@ def do_retest(job: Job, search: Search) -> int:
 
 
 def retested(
-    job: Job, search: Search, ranked: list[Candidate], candidates: list[Candidate]
+    job: Job, search: Search, ranked: list[FrozenTrial], chosen: list[FrozenTrial]
 ) -> tuple[int, Outcome]:
     """Do the re-test; return the exit code and the outcome."""
     from rl_yardstick.experiments.analysis import analyse
@@ -290,10 +287,9 @@ def retested(
     from rl_yardstick.tuning.retesting import FOLDER, concluded, is_settled, retest_study
 
     tuning, again = search.tuning, replace(job, root=job.root / FOLDER)
-    study = retest_study(tuning, job.root, candidates)
-    looks = ()
-    if tuning.until_decided:
-        looks = plan_of_looks(study, again.root, tuning.max_retest_seeds)
+    study = retest_study(tuning, job.root, chosen)
+    is_growing, most = tuning.until_decided, tuning.max_retest_seeds
+    looks = plan_of_looks(study, again.root, most) if is_growing else ()
     record = StudyRecord(study, specs_of(study), looks)
     with held(again.root):
         record.write(again.root)
@@ -303,7 +299,7 @@ def retested(
             results = do_study(again, study, plan(study, again.root, specs=record.specs))
         code = conclude(again, results, looks)
         with job.console.status("judging the winner"):
-            return code, concluded(tuning, ranked, candidates, analyse(results, looks))
+            return code, concluded(tuning, ranked, chosen, analyse(results, looks))
 
 
 def write_down(job: Job, search: Search, outcome: Outcome | None) -> None:
@@ -386,25 +382,18 @@ def print_search(console: Console, search: Search) -> None:
 
 
 def print_outcome(console: Console, outcome: Outcome) -> None:
-    """Print the table of the re-test, the optimism of the search, and why nothing won."""
-    from rich.table import Table
-
-    def figure(value: float | None) -> str:
-        return "" if value is None else f"{value:.4g}"
-
+    """Print a line on each setting of the re-test, the optimism of the search, and why none won."""
     held_out = outcome.held_out
-    console.print()
-    title = f"re-test on the seeds {held_out.start} to {held_out.stop - 1}"
-    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    headings = "settings, in the search, on other seeds, 95 % interval, is, runs, failed"
-    for heading in headings.split(", "):
-        table.add_column(heading)
+    say(console, f"\nsettings on the seeds {held_out.start} to {held_out.stop - 1}:")
     for each in outcome.retested:
-        interval = each.interval
-        ends = "" if interval is None else f"{interval.low:.4g} to {interval.high:.4g}"
-        figures = (each.label, figure(each.in_search), figure(each.held_out), ends, each.verdict)
-        table.add_row(*figures, str(each.n_runs), figure(each.n_failed))
-    console.print(table, highlight=False)
+        words = [f"{each.n_runs} runs"]
+        if each.held_out is not None and each.interval is not None:
+            ends = f"{each.interval.low:.4g} to {each.interval.high:.4g}"
+            words = [f"{each.held_out:.4g} (95 % interval of the mean: {ends})", *words]
+        words += [f"{each.n_failed} failed"] if each.n_failed else []
+        words += [f"in the search {each.in_search:.4g}"] if each.in_search is not None else []
+        words += [f"against shipped: {each.verdict}"] if each.verdict else []
+        say(console, f"  {each.label}: {', '.join(words)}")
     if outcome.optimism is not None:
         optimism = "optimism of the search, its best there less the same on other seeds"
         say(console, f"{optimism}: {round(outcome.optimism, 9):+.4g}")
@@ -412,42 +401,38 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
         say(console, f"no winner: {outcome.reason}; they stay as they are")
 
 
-class TuningProgress:
-    """The progress of a search: a bar on a terminal, and else a line now and then."""
+@contextmanager
+def progress(
+    console: Console, search: Search
+) -> Iterator[Callable[[int, float | None, str], None]]:
+    """A bar on a terminal, and else a line now and then; failures and the best trials anyway.
 
-    def __init__(self, console: Console, search: Search) -> None:
-        self.console, self.total = console, search.n_trials
-        self.sign = 1 if search.tuning.is_cost else -1
-        trials = [trial for trial in search.trials if trial.state.is_finished()]
-        self.values = {t.number: t.value if t.state.name == "COMPLETE" else None for t in trials}
-        columns = TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        best = TextColumn("{task.description}")
-        self.bar = Progress(
-            *columns, best, console=console, transient=True, disable=not console.is_terminal
-        )
-        self.task = self.bar.add_task("", total=self.total, completed=len(trials))
-        self.begun = self.told_at = time.monotonic()
+    Yields what is to be called with the number of a trial that has ended, its value, and the reason
+    of a failure.
+    """
+    sign = 1 if search.tuning.is_cost else -1
+    ended = [trial for trial in search.trials if trial.state.is_finished()]
+    whole = [trial for trial in ended if trial.state.name == "COMPLETE"]
+    best = min((sign * trial.value for trial in whole if trial.value is not None), default=math.inf)
+    n_ended, told_at, is_live = len(ended), time.monotonic(), console.is_terminal
+    columns = TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    words = TextColumn("{task.description}")
+    with Progress(*columns, words, console=console, transient=True, disable=not is_live) as bar:
+        task = bar.add_task("", total=search.n_trials, completed=n_ended)
 
-    def __enter__(self) -> TuningProgress:
-        self.bar.start()
-        return self
+        def tell(number: int, value: float | None, reason: str) -> None:
+            nonlocal best, n_ended, told_at
+            n_ended += 1
+            if reason:
+                say(console, f"trial {number} failed: {reason}")
+            elif value is not None and sign * value < best:
+                best = sign * value
+                say(console, f"trial {number}: {value:.4g}, the best so far")
+            text = f"best {sign * best:.4g}" if best < math.inf else ""
+            bar.update(task, completed=n_ended, description=text)
+            if not is_live and time.monotonic() - told_at > SECONDS_BETWEEN_LINES:
+                told_at = time.monotonic()
+                done = f"{n_ended} of {search.n_trials} trials"
+                say(console, f"{done}; {text}" if text else done)
 
-    def __exit__(self, *error: object) -> None:
-        self.bar.stop()
-
-    def trial_ended(self, number: int, value: float | None, reason: str) -> None:
-        """Count a trial that has ended, and print a line if it failed or is the best so far."""
-        best = min((self.sign * v for v in self.values.values() if v is not None), default=math.inf)
-        self.values[number] = value
-        if reason:
-            say(self.console, f"trial {number} failed: {reason}")
-        elif value is not None and self.sign * value < best:
-            say(self.console, f"trial {number}: {value:.4g}, the best so far")
-            best = self.sign * value
-        words = f"best {self.sign * best:.4g}" if best < math.inf else ""
-        self.bar.update(self.task, completed=len(self.values), description=words)
-        now = time.monotonic()
-        if not self.console.is_terminal and now - self.told_at > SECONDS_BETWEEN_LINES:
-            self.told_at, n = now, len(self.values)
-            text = f"{n} of {self.total} trials in {now - self.begun:.0f} s"
-            say(self.console, f"{text}; {words}" if words else text)
+        yield tell

@@ -119,7 +119,8 @@ class PlannedRun:
 def _settings(spec: Any) -> dict[str, Any]:
     """The settings of a spec that decide its results, by name."""
     spec = {k: v for k, v in plain(spec or {}).items() if k not in MAY_DIFFER and k != "seed"}
-    return {**spec, **spec.pop("algorithm", {})}
+    algorithm = spec.pop("algorithm", {})
+    return {**spec, **algorithm}
 
 
 # --- the runs of a study --------------------------------------------------------------------------

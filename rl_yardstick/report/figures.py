@@ -500,7 +500,7 @@ def draw_sweeps(axes: Axes, one: EnvironmentSeries, metric: str) -> None:
     values = np.unique(np.concatenate([sweep.means.x for sweep in sweeps.values()]))
     words = _set_scale_of_values(axes, values)
     best = with_best_mean(environment, *(sweep.labels for sweep in sweeps.values()))
-    rings: list[tuple[float, float]] = []
+    rings: list[list[float]] = []
     for place, (group, sweep) in enumerate(sweeps.items()):
         mark = Mark(group, place % len(COLOURS), DASHES[place % len(DASHES)])
         x, y = sweep.means.x, sweep.means.y
@@ -518,7 +518,8 @@ def draw_sweeps(axes: Axes, one: EnvironmentSeries, metric: str) -> None:
         prefix = f"{next(iter(sweeps))} with " if len(sweeps) == 1 else ""
         told = enumeration([label.removeprefix(prefix) for label in best])
         label = f"best mean: {told}" if len(best) <= FEW else "best mean"
-        axes.scatter(*np.transpose(rings), 90, "none", edgecolor="black", label=label, zorder=3)
+        x, y = np.transpose(rings)
+        axes.scatter(x, y, 90, "none", edgecolor="black", label=label, zorder=3)
     if len(values) <= MOST_TICKS:
         axes.xaxis.set_major_locator(FixedLocator(_ticks_apart(axes, values)))
         axes.xaxis.set_minor_locator(NullLocator())
@@ -654,7 +655,7 @@ def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Mark
             axes.sharey(places[0])
         for axes, (agent, blocks) in zip(places, found.items(), strict=False):
             words = _set_scale(axes, linear_up_to(curves, None))
-            look = {"marker": "o", "markersize": 3, "color": COLOURS[marks[agent].colour]}
+            look: Any = {"marker": "o", "markersize": 3, "color": COLOURS[marks[agent].colour]}
             for column, style in BLOCKS.items():
                 axes.plot(blocks["episode"], blocks[column], style, **look)
             lettering(axes, title=agent, x="episode", y=f"return{words}")

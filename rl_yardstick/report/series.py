@@ -187,8 +187,9 @@ def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Bel
     points = np.linspace(low, high, N_POINTS)
     densities = family.pdf(points, parameters[..., :1], parameters[..., 1:])
     _, n_contexts, n_arms, _ = parameters.shape
-    has_means = n_contexts == len(means)
-    true_means = means.tolist() if has_means else [[None] * n_arms] * n_contexts
+    true_means: list[list[float | None]] = [[None] * n_arms] * n_contexts
+    if n_contexts == len(means):
+        true_means = means.tolist()
     return Belief(agent, statistics.moments, points, densities, true_means)
 
 

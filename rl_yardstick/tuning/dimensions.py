@@ -34,73 +34,19 @@ Conditions = dict[str, tuple[Word, ...]]
 Scale = Literal["linear", "log", "log_below_one", "powers_of_two"]
 # The meaning of a number: a constant, or the start of a schedule.
 FORMS = ("constant", "linear", "exponential")
-FINAL_SHARE = (0.001, 1.0)
 LEFT_OUT = object()  # in place of a setting that is not given
 _PREFIXES: Mapping[str, str] = {"log_below_one": "one_minus_", "powers_of_two": "log2_"}
 
 
 @dataclass(frozen=True)
-class Choice:
-    """One of several values, or one of several sets of settings."""
+class Range:
+    """The numbers between two ends (integers if both are), with six digits for readable files."""
 
-    name: str  #: name of the parameter
-    options: dict[Word, dict[str, Any]]  #: the flat settings of each word
-    when: Conditions = field(default_factory=dict)
-
-    @cached_property
-    def keys(self) -> tuple[str, ...]:
-        """The names of its settings."""
-        return tuple(dict.fromkeys(key for option in self.options.values() for key in option))
-
-    @cached_property
-    def distributions(self) -> dict[str, BaseDistribution]:
-        """The distribution of each of its parameters."""
-        return {self.name: CategoricalDistribution(tuple(self.options))}
-
-    def settings(self, pick: Pick) -> dict[str, Any]:
-        """The chosen settings; calls ``pick`` only for the needed parameters."""
-        return self._decided(self.options[pick(self.name, self.distributions[self.name])])
-
-    def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters that give these settings; LookupError if there are none."""
-        for word, option in self.options.items():
-            if same(self._decided(option), self._decided(settings)):
-                return {self.name: word}
-        raise LookupError(self.name)
-
-    def including(self, settings: Mapping[str, Any]) -> Choice:
-        """This dimension, widened if necessary to include these settings."""
-        with suppress(LookupError):
-            self.params_of(settings)
-            return self
-        added = self._decided(settings)
-        value = added.get(self.name, LEFT_OUT)
-        # The value itself, if that is clearer for readers.
-        speaks = all(is_word(option.get(self.name)) for option in self.options.values())
-        word = value if speaks and is_word(value) and value not in self.options else SHIPPED
-        return replace(self, options={**self.options, word: added})
-
-    def _decided(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        return {key: settings.get(key, LEFT_OUT) for key in self.keys}
-
-
-@dataclass(frozen=True)
-class NumberRange:
-    """A number between two ends (an integer if both are), or a schedule or word in its place.
-
-    Chosen numbers have six digits to keep files readable.
-    """
-
-    name: str  #: name of the setting
     low: int | float  #: included
     high: int | float  #: included
     scale: Scale = "linear"  #: of equal steps; on "powers_of_two" only these are values
-    #: The allowed words of `FORMS`, and words that replace the number.
-    forms: tuple[Word, ...] = ("constant",)
     #: The range of an exponential schedule's end, as a share of its start.
-    final_share: tuple[float, float] = FINAL_SHARE
-    when: Conditions = field(default_factory=dict)
-    instead: dict[str, Any] = field(default_factory=dict)  #: other values in place of the number
+    final_share: tuple[float, float] = (0.001, 1.0)
 
     def __post_init__(self) -> None:
         low, high, share = self.low, self.high, self.final_share
@@ -112,55 +58,28 @@ class NumberRange:
             raise ValueError(f"scale log_below_one needs high below 1, not {high}")
         if self.scale == "powers_of_two" and not (is_power(low) and is_power(high)):
             raise ValueError("scale powers_of_two needs whole powers of two as low and high")
-        if not any(form in FORMS for form in self.forms):
-            raise ValueError(f"forms must name one of {', '.join(FORMS)}, and what else may be")
         if not 0 < share[0] < share[1] < np.inf:
             raise ValueError("final_share must be two numbers above 0, the smaller one first")
         if not (isinstance(low, int) and isinstance(high, int)):
             object.__setattr__(self, "low", float(low))
             object.__setattr__(self, "high", float(high))
 
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """The names of its settings."""
-        return (self.name,)
-
     @cached_property
-    def _words(self) -> tuple[Word, ...]:
-        """Optuna's words for the forms, the schedules first."""
-        first = sorted(self.forms, key=lambda form: form not in FORMS)
-        return tuple(dict.fromkeys((*first, *self.instead)))
-
-    @property
-    def _names(self) -> tuple[str, str, str]:
-        """The names of its parameters: number, form, and share of the end."""
-        prefix = _PREFIXES.get(self.scale, "")
-        return prefix + self.name, f"{self.name}_form", f"{self.name}_final_share"
-
-    @cached_property
-    def distributions(self) -> dict[str, BaseDistribution]:
-        """The distribution of each of its parameters."""
-        number, form, share = self._names
-        found: dict[str, BaseDistribution] = {}
-        if len(self._words) > 1:
-            found[form] = CategoricalDistribution(self._words)
-        low, high = sorted((self._parameter(self.low), self._parameter(self.high)))
+    def distribution(self) -> FloatDistribution | IntDistribution:
+        """The distribution of Optuna's parameter for the number."""
+        low, high = sorted((self.parameter(self.low), self.parameter(self.high)))
         is_log = self.scale in ("log", "log_below_one")
         if isinstance(low, int) and isinstance(high, int):
-            found[number] = IntDistribution(low, high, log=is_log)
-        else:
-            found[number] = FloatDistribution(low, high, log=is_log)
-        if "exponential" in self.forms:
-            found[share] = FloatDistribution(*self.final_share, log=True)
-        return found
+            return IntDistribution(low, high, log=is_log)
+        return FloatDistribution(low, high, log=is_log)
 
-    def _parameter(self, number: float) -> float:
+    def parameter(self, number: float) -> float:
         """Convert a number to Optuna's parameter."""
         if self.scale == "log_below_one":
             return tidy(1.0 - number)
         return int(number).bit_length() - 1 if self.scale == "powers_of_two" else number
 
-    def _number_of(self, parameter: float) -> float:
+    def number(self, parameter: float) -> float:
         """Convert Optuna's parameter to a number."""
         if self.scale == "log_below_one":
             return round(1.0 - tidy(parameter), 12)
@@ -169,14 +88,57 @@ class NumberRange:
         number = parameter if isinstance(parameter, int) else tidy(parameter)
         return min(max(number, self.low), self.high)
 
+
+@dataclass(frozen=True)
+class Dimension:
+    """A choice of values or of sets of settings, a number, or a number with words in its place."""
+
+    name: str  #: of the setting, or of the choice of several settings
+    options: dict[Word, dict[str, Any]]  #: the flat settings of each word
+    #: The words of `FORMS` that a number may have, and its range; empty and None for a choice.
+    forms: tuple[str, ...] = ()
+    range: Range | None = None
+    when: Conditions = field(default_factory=dict)
+
+    @cached_property
+    def keys(self) -> tuple[str, ...]:
+        """The names of its settings."""
+        number = [] if self.range is None else [self.name]
+        return tuple(dict.fromkeys([*number, *(key for o in self.options.values() for key in o)]))
+
+    @property
+    def words(self) -> tuple[Word, ...]:
+        """What Optuna chooses from, before it chooses a number."""
+        return (*self.forms, *self.options)
+
+    @cached_property
+    def _parameters(self) -> tuple[str, str, str]:
+        """The names of its parameters: word, number, and share of the end."""
+        if self.range is None:
+            return self.name, "", ""
+        prefix = _PREFIXES.get(self.range.scale, "")
+        return f"{self.name}_form", prefix + self.name, f"{self.name}_final_share"
+
+    @cached_property
+    def distributions(self) -> dict[str, BaseDistribution]:
+        """The distribution of each of its parameters."""
+        word, number, share = self._parameters
+        found: dict[str, BaseDistribution] = {}
+        if len(self.words) > 1:
+            found[word] = CategoricalDistribution(self.words)
+        if self.range is not None:
+            found[number] = self.range.distribution
+        if self.range is not None and "exponential" in self.forms:
+            found[share] = FloatDistribution(*self.range.final_share, log=True)
+        return found
+
     def settings(self, pick: Pick) -> dict[str, Any]:
         """The chosen settings; calls ``pick`` only for the needed parameters."""
-        number, form, share = self._names
-        ranges = self.distributions
-        word = pick(form, ranges[form]) if form in ranges else self._words[0]
-        if word not in FORMS:
-            return {self.name: self.instead.get(word, word)}
-        start = self._number_of(pick(number, ranges[number]))
+        ranges, (choice, number, share) = self.distributions, self._parameters
+        word = pick(choice, ranges[choice]) if choice in ranges else self.words[0]
+        if self.range is None or word not in self.forms:
+            return self._decided(self.options[word])
+        start = self.range.number(pick(number, ranges[number]))
         if word == "constant":
             return {self.name: start}
         if word == "linear":
@@ -185,17 +147,16 @@ class NumberRange:
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """The parameters that give these settings; LookupError if there are none."""
-        number, form, share = self._names
-        value = settings.get(self.name, LEFT_OUT)
-        for word in self._words:
-            if word not in FORMS and same(value, self.instead.get(word, word)):  # type: ignore[arg-type]
-                return {form: word}
-        kind, start, end = read = _read(value)
-        if kind is None:
+        choice, number, share = self._parameters
+        for option, given in self.options.items():
+            if same(self._decided(given), self._decided(settings)):
+                return {choice: option}
+        form, start, end = read = _read(settings.get(self.name))
+        if self.range is None or form is None:
             raise LookupError(self.name)
-        params: dict[str, Any] = {form: kind} if form in self.distributions else {}
-        params[number] = self._parameter(start)
-        if kind == "exponential":
+        params: dict[str, Any] = {choice: form} if choice in self.distributions else {}
+        params[number] = self.range.parameter(start)
+        if form == "exponential":
             params[share] = end / start
         if all(self._holds(name, value) for name, value in params.items()):
             again = self.settings(lambda name, _: params[name])[self.name]
@@ -209,29 +170,34 @@ class NumberRange:
             return bool(kind.low <= value <= kind.high)
         return isinstance(kind, CategoricalDistribution) and value in kind.choices
 
-    def including(self, settings: Mapping[str, Any]) -> NumberRange:
+    def _decided(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: settings.get(key, LEFT_OUT) for key in self.keys}
+
+    def including(self, settings: Mapping[str, Any]) -> Dimension:
         """This dimension, widened if necessary to include these settings."""
-        value = settings.get(self.name, LEFT_OUT)
-        kind, start, end = _read(value)
+        added = self._decided(settings)
+        value = added.get(self.name, LEFT_OUT)
         changes: list[dict[str, Any]] = [{}]
-        if kind is not None:
-            low, high = self.final_share
-            share = end / start if kind == "exponential" else low
-            other = {"forms": tuple(dict.fromkeys((*self.forms, kind)))}
-            ends = {"low": min(self.low, start), "high": max(self.high, start)}
-            ends["final_share"] = min(low, share), max(high, share)
-            changes += [other, {**other, **ends}]
+        form, start, end = _read(value)
+        if self.range is not None and form is not None:
+            forms = tuple(dict.fromkeys((*self.forms, form)))
+            low, high = self.range.final_share
+            share = end / start if form == "exponential" else low
+            ends = {"low": min(self.range.low, start), "high": max(self.range.high, start)}
+            changes.append({"forms": forms})
+            with suppress(ValueError):
+                shares = min(low, share), max(high, share)
+                wider = replace(self.range, **ends, final_share=shares)  # type: ignore[arg-type]
+                changes.append({"forms": forms, "range": wider})
         for each in changes:
             with suppress(LookupError, ValueError):
-                wider = replace(self, **each)
-                wider.params_of(settings)
-                return wider
-        if is_word(value) and value not in self._words:
-            return replace(self, forms=(*self.forms, value))
-        return replace(self, instead={**self.instead, SHIPPED: value})
-
-
-Dimension = Choice | NumberRange
+                found = replace(self, **each)
+                found.params_of(settings)
+                return found
+        # The value itself as the word, if that is clearer for readers.
+        speaks = all(is_word(option.get(self.name)) for option in self.options.values())
+        word = value if speaks and is_word(value) and value not in self.words else SHIPPED
+        return replace(self, options={**self.options, word: added})
 
 
 def spread(distribution: BaseDistribution, n: int) -> list[Any]:

@@ -122,20 +122,6 @@ def worse_by_ranks(race: Race) -> bool:
     return bool(wilcoxon(lead, alternative="less", zero_method="zsplit").pvalue < P_THRESHOLD)
 
 
-def worse_by_means(race: Race) -> bool:
-    """Whether a paired t test on the common seeds finds the trial worse than the best one.
-
-    Source: racing as in Birattari et al. (2002), "A racing algorithm for configuring
-    metaheuristics", GECCO, with the t test that irace offers.
-    """
-    from scipy.stats import ttest_1samp
-
-    lead = race.lead
-    if not lead or len(set(lead)) == 1:
-        return bool(lead)
-    return bool(ttest_1samp(lead, 0, alternative="less").pvalue < P_THRESHOLD)
-
-
 def cannot_win(race: Race) -> bool:
     """Whether the trial stays below the best one even with perfect scores on all other seeds.
 
@@ -160,6 +146,5 @@ PRUNERS: Mapping[str, Callable[[Race], bool]] = {
     "bound": cannot_win,
     "median": below_median,
     "halving": out_of_the_race,
-    "racing": worse_by_means,
     "wilcoxon": worse_by_ranks,
 }

@@ -23,11 +23,11 @@ from rl_yardstick.pipeline.errors import UserError, shown, unknown
 from rl_yardstick.pipeline.settings import COMPONENTS, HYPERPARAMS, SPECIAL, override, read_yaml
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.tuning.dimensions import (
+    FORMS,
     LEFT_OUT,
-    Choice,
     Dimension,
-    NumberRange,
     Pick,
+    Range,
     is_word,
     same,
     spread,
@@ -173,7 +173,7 @@ def _needed(space: SearchSpace, dimension: Dimension) -> dict[str, Any]:
 
 # --- reading from a file --------------------------------------------------------------------------
 
-_RANGE = ("low", "high", "scale", "forms", "final_share", "when")
+_RANGE = ("low", "high", "scale", "forms", "final_share")
 
 
 def read_search_space(algo: str, env_id: str, path: Path | str | None = None) -> SearchSpace:
@@ -203,17 +203,17 @@ def read_search_space(algo: str, env_id: str, path: Path | str | None = None) ->
 def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
     """The place of an environment's entry, and the entry merged with the default."""
     file = read_yaml(path)
-    for name, entry in file.items() if isinstance(file, dict) else [("", None)]:
-        is_entry = isinstance(entry, dict) and all(isinstance(key, str) for key in entry)
-        if not (isinstance(name, str) and (is_entry or entry is None)) or not name:
-            raise UserError(
-                f"{path}: must map environment ids to names of settings and their ranges"
-            )
+    entries = [*file.items()] if isinstance(file, dict) else []
+    if (
+        not all(isinstance(n, str) and isinstance(e, dict | type(None)) for n, e in entries)
+        or not entries
+    ):
+        raise UserError(f"{path}: must map environment ids to names of settings and their ranges")
     if env_id not in file and "default" not in file:
         raise UserError(f"{path}: no entry for {shown(env_id)}, and no default")
     both = {**(file.get("default") or {}), **(file.get(env_id) or {})}
     where = f"{path}: {env_id if env_id in file else 'default'}"
-    return where, {name: value for name, value in both.items() if value is not None}
+    return where, {str(name): value for name, value in both.items() if value is not None}
 
 
 def _dimension(name: str, said: Any, place: str) -> Dimension:
@@ -224,32 +224,35 @@ def _dimension(name: str, said: Any, place: str) -> Dimension:
             f"{place} must be a list of values, or map low and high, choices or sets to theirs; "
             f"not {shown(said)}"
         )
-    kind = next((key for key in ("choices", "sets") if key in said), "low")
-    known = _RANGE if kind == "low" else (kind, "when")
+    kind = next((key for key in ("choices", "sets") if key in said), "forms")
+    known = ("when", *((kind,) if kind != "forms" else _RANGE))
     for key in said:
         if key not in known:
             raise unknown(f"{place}: unknown key", str(key), known)
-    found: dict[str, Any] = {"name": name, **said}
-    if isinstance(when := said.get("when"), dict):
-        found["when"] = {k: v if isinstance(v, list) else [v] for k, v in when.items()}
-    if kind != "low":
-        options = found.pop(kind)
-        if isinstance(options, list):
-            if strange := [value for value in options if not is_word(value)]:
-                example = "choices: {small: [64, 64]}"
-                raise UserError(f"{place}: {shown(strange[0])} needs a name, as in {example}")
-            options = dict(zip(options, options, strict=True))
-        if not isinstance(options, dict) or len(options) < 2:
-            raise UserError(f"{place}: there must be two values at least to choose from")
-        is_set = kind == "sets"
-        found["options"] = options if is_set else {k: {name: v} for k, v in options.items()}
+    options, when = said.get(kind, ["constant"]), said.get("when", {})
+    if isinstance(options, list):
+        if strange := [value for value in options if not is_word(value)]:
+            example = "choices: {small: [64, 64]}"
+            raise UserError(f"{place}: {shown(strange[0])} needs a name, as in {example}")
+        options = {value: value for value in options}
+    if not (isinstance(options, dict) and isinstance(when, dict)):
+        raise UserError(f"{place}: {kind} must be a list or a mapping, and when a mapping")
+    forms = tuple(word for word in options if kind == "forms" and word in FORMS)
+    if kind == "forms" and not forms:
+        raise UserError(f"{place}: forms must name one of {', '.join(FORMS)}")
+    if kind != "forms" and len(options) < 2:
+        raise UserError(f"{place}: there must be two values at least to choose from")
+    words = {k: v if kind == "sets" else {name: v} for k, v in options.items() if k not in forms}
+    conditions = {k: tuple(v) if isinstance(v, list) else (v,) for k, v in when.items()}
+    numbers = {key: value for key, value in said.items() if key not in ("forms", "when")}
     try:
-        return NumberRange(**found) if kind == "low" else Choice(**found)
+        limits = Range(**numbers) if kind == "forms" else None
+        return Dimension(name, words, forms, limits, conditions)
     except ValidationError as error:
         first = error.errors()[0]
-        key = f"{first['loc'][0]} " if first["loc"] else ""
-        reason = first["msg"].removeprefix("Value error, ").replace("Input should", "must")
-        raise UserError(f"{place}: {key.replace('options', kind)}{reason}") from None
+        key = f"{first['loc'][0]}: " if first["loc"] else ""
+        reason = first["msg"].removeprefix("Value error, ")
+        raise UserError(f"{place}: {key}{reason[:1].lower()}{reason[1:]}") from None
 
 
 def _check_names(entries: Mapping[str, Dimension], where: str) -> None:
@@ -271,7 +274,7 @@ def _check_names(entries: Mapping[str, Dimension], where: str) -> None:
 
 def _check_conditions(entries: Mapping[str, Dimension], where: str) -> None:
     """Check that conditions name earlier choices, and existing words of these."""
-    before: dict[str, Choice] = {}
+    before: dict[str, Dimension] = {}
     for name, each in entries.items():
         for other, words in each.when.items():
             place = f"{where}: {name}: when"
@@ -281,7 +284,7 @@ def _check_conditions(entries: Mapping[str, Dimension], where: str) -> None:
             strange = next((word for word in words if word not in options), None)
             if strange is not None:
                 raise unknown(f"{place}: {other} has no value", str(strange), map(str, options))
-        if isinstance(each, Choice):
+        if each.range is None:
             before[name] = each
 
 

@@ -6,11 +6,11 @@ were under way are taken up again with the same settings, and their finished run
 
 from __future__ import annotations
 
-import json
 import math
 import sqlite3
 import time
-from collections.abc import Callable, Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -21,8 +21,7 @@ import optuna
 from optuna import Study, Trial
 from optuna.distributions import distribution_to_json
 from optuna.exceptions import StorageInternalError
-from optuna.storages import BaseStorage, JournalStorage, RDBStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages import BaseStorage, RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -34,14 +33,14 @@ from rl_yardstick.pipeline.files import plain
 from rl_yardstick.tuning.pruning import is_hopeless
 from rl_yardstick.tuning.search_spaces import read_search_space
 from rl_yardstick.tuning.suggesting import (
+    SeededSampler,
     Suggestions,
-    make_sampler,
     name_of,
     planned_runs,
     shipped_entry,
     shipped_run,
 )
-from rl_yardstick.tuning.tuning_spec import AUTO, COST_OF_THRESHOLD, TuningSpec
+from rl_yardstick.tuning.tuning_spec import AUTO, COST_OF_THRESHOLD, TuningSpec, without_secret
 from rl_yardstick.verdicts import steps_to_threshold
 
 OWN_FILE = "trials.db"
@@ -86,29 +85,26 @@ def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
     row, name = results.rows[0], tuning.figure
     if name == "score" and row.get(name) is None:  # no known optimum
         name = "final"
-    is_cost = name in COST_OF_THRESHOLD
-    figure = _cost(tuning, name, row, results.curves[0]) if is_cost else row.get(name)
+    figure = _cost(name, row, results.curves) if name in COST_OF_THRESHOLD else row.get(name)
     if figure is None or not math.isfinite(figure):
-        raise UserError(f"it has no figure for {name}")
-    steps = None
-    if name == "score" and figure >= OPTIMAL_SCORE and row.get("threshold") is not None:
-        steps = _cost(tuning, "steps", row, results.curves[0])
+        hint = ": no threshold is known; give --threshold" if name in COST_OF_THRESHOLD else ""
+        raise UserError(f"it has no figure for {name}{hint}")
+    is_optimal = name == "score" and figure >= OPTIMAL_SCORE
+    steps = _cost("steps", row, results.curves) if is_optimal else None
     return RunOutcome(float(figure), float(row.get("cpu_seconds") or row["seconds"]), name, steps)
 
 
-def _cost(tuning: TuningSpec, name: str, row: Mapping[str, Any], evaluations: Curve) -> float:
-    """Steps or seconds until the learning curve reaches the threshold.
+def _cost(name: str, row: Mapping[str, Any], curves: Sequence[Curve]) -> float | None:
+    """Steps or seconds until the learning curve reaches the threshold; None without one.
 
     Source: for PAR-k, Hutter et al. (2009), "ParamILS", JAIR 36.
     """
-    threshold, env_id = row.get("threshold"), tuning.environment.env_id
-    if threshold is None:
-        raise UserError(f"--metric {name}: no threshold is known on {env_id}; give --threshold")
-    figures = evaluations.figures
-    points = figures["step" if name == "steps" else "seconds"]
-    reached = steps_to_threshold(points, figures["value"], float(threshold))
+    if (threshold := row.get("threshold")) is None:
+        return None
+    points = curves[0].figures["step" if name == "steps" else "seconds"]
+    reached = float(steps_to_threshold(points, curves[0].figures["value"], float(threshold)))
     whole = float(row["n_timesteps" if name == "steps" else "seconds"])
-    return float(reached) if math.isfinite(reached) else WHOLE_RUNS * whole
+    return reached if math.isfinite(reached) else WHOLE_RUNS * whole
 
 
 def outcomes_of(trial: FrozenTrial) -> dict[int, RunOutcome]:
@@ -119,19 +115,42 @@ def outcomes_of(trial: FrozenTrial) -> dict[int, RunOutcome]:
 # --- its trials -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass
+class _UnderWay:
+    """A trial that has begun."""
+
+    trial: Trial  # Optuna's trial
+    to_do: list[PlannedRun] = field(default_factory=list)  # runs that have not begun, in order
+    runs: dict[int, RunOutcome] = field(default_factory=dict)  # by seed
+    n_running: int = 0
+    is_over: bool = False  # whether further results are ignored
+
+
 class Search:
-    """A checked search with open storage."""
+    """A search with open storage: hands out runs one by one, and ends trials by their results.
 
-    tuning: TuningSpec  # its specification
-    root: Path  # its folder
-    study: Study  # Optuna's study
-    suggestions: Suggestions  # the settings of its trials
+    Attributes:
+        tuning: its specification.
+        root: its folder.
+        study: Optuna's study.
+        suggestions: the settings of its trials.
+        n_trials: the number of trials when the search is done.
+        tell: called with the number of each trial that ends, its value (None if it was pruned or
+            failed), and the reason of a failure.
+        deadline: no run begins after this time (`time.monotonic`).
+    """
 
-    @property
-    def n_trials(self) -> int:
-        """The number of trials when the search is done."""
-        return self.suggestions.n_trials
+    def __init__(
+        self, tuning: TuningSpec, root: Path, study: Study, suggestions: Suggestions
+    ) -> None:
+        self.tuning, self.root, self.study, self.suggestions = tuning, root, study, suggestions
+        self.n_trials = suggestions.n_trials
+        self.tell: Callable[[int, float | None, str], None] = lambda *_: None
+        self.deadline = math.inf
+        self._trials: list[_UnderWay] = []
+        # Trials that wait for a run, by its folder: trials with equal settings share it.
+        self._waiting: dict[Path, list[_UnderWay]] = {}
+        self._failures: list[str] | None = []  # since the start; None after a success
 
     @property
     def trials(self) -> list[FrozenTrial]:
@@ -141,8 +160,7 @@ class Search:
     @property
     def is_done(self) -> bool:
         """Whether every trial has ended."""
-        trials = self.trials
-        return len(trials) == self.n_trials and all(each.state.is_finished() for each in trials)
+        return sum(each.state.is_finished() for each in self.trials) == self.n_trials
 
     @property
     def n_at_optimum(self) -> int:
@@ -160,165 +178,26 @@ class Search:
         """Whether enough settings have the optimum on all seeds, so that the search can end."""
         return self.n_at_optimum >= max(ENOUGH_AT_OPTIMUM, self.tuning.retest)
 
-    def is_hopeless(self, number: int, runs: Mapping[int, RunOutcome]) -> bool:
-        """Whether a trial can no longer be the best, by its seeds so far."""
-        sign = -1.0 if self.tuning.is_cost else 1.0  # costs change their sign: higher is better
-
-        def scores(runs: Mapping[int, RunOutcome]) -> dict[int, float]:
-            return {seed: sign * run.figure for seed, run in runs.items()}
-
-        # A score of 1 is the optimum. Without a known optimum, figures are returns, for which 1
-        # means nothing.
-        are_scores = any(run.name == "score" for run in runs.values())
-        return is_hopeless(
-            scores(runs),
-            [scores(outcomes_of(trial)) for trial in self.trials if trial.number != number],
-            self.tuning.pruner,
-            lambda values: sign * self.tuning.value([sign * value for value in values]),
-            n_seeds=len(self.tuning.seeds),
-            ceiling=1.0 if are_scores else -math.inf,
-        )
-
-
-def open_search(tuning: TuningSpec, root: Path, storage: str | None = None) -> Search:
-    """Check a search, and open or create its trials.
-
-    Args:
-        tuning: the search.
-        root: its folder, which is locked by this process.
-        storage: a file, or the URL of a database; None for ``trials.db`` in the folder.
-
-    Raises:
-        UserError: if the search cannot be done, or the storage has another one of this name.
-    """
-    run = shipped_run(tuning, root)
-    agent, environment = tuning.agent, tuning.environment
-    if tuning.figure == AUTO:
-        is_bandit = ALGORITHMS[agent.algo].for_bandits
-        tuning = replace(tuning, figure="regret" if is_bandit else "score")
-    space = read_search_space(agent.algo, environment.env_id, tuning.search_space)
-    suggestions = Suggestions(tuning, space, shipped_entry(run.spec))
-    if not suggestions.n_free:
-        raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
-    suggestions.check(root)
-    return opened(tuning, root, suggestions, open_storage(root, storage))
-
-
-def opened(
-    tuning: TuningSpec, root: Path, suggestions: Suggestions, storage: BaseStorage
-) -> Search:
-    """Open or create the trials of a checked search."""
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    study = optuna.create_study(
-        study_name=tuning.study.name,
-        storage=storage,
-        sampler=make_sampler(tuning),
-        pruner=optuna.pruners.NopPruner(),  # `tuning.pruning` decides
-        direction="minimize" if tuning.is_cost else "maximize",
-        load_if_exists=True,
-    )
-    ranges = suggestions.space.distributions
-    as_json = {name: distribution_to_json(kind) for name, kind in ranges.items()}
-    asked, before = tuning.identity(suggestions.shipped, as_json), study.user_attrs.get(ASKED)
-    if before is None:
-        study.set_user_attr(ASKED, asked)
-    elif before != asked:
-        named = [key for key in asked if before.get(key) != asked[key]]
-        words = "; ".join(
-            f"{key}: {shown(before.get(key))} there, {shown(asked[key])} now" for key in named[:3]
-        )
-        raise UserError(
-            f"{tuning.study.name}: the search there is another ({words}): --name NAME makes one of "
-            "its own"
-        )
-    for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-        # Its driver is gone, since this process holds the folder: Optuna hands it out again.
-        study._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
-    return Search(tuning, root, study, suggestions)
-
-
-def open_storage(root: Path, given: str | None = None) -> BaseStorage:
-    """Open a storage of trials, see `open_search`."""
-    if given is None:
-        # Opened by path, because in a URL some characters have another meaning.
-        path = root / OWN_FILE
-        connect = partial(sqlite3.connect, path, SECONDS_TO_WAIT, check_same_thread=False)
-        return RDBStorage(f"sqlite:///{OWN_FILE}", engine_kwargs={"creator": connect})
-    if "://" in given:
-        return RDBStorage(given.replace("{", "{{").replace("}", "}}"))  # Optuna replaces braces
-    return JournalStorage(JournalFileBackend(given.removeprefix("journal:")))
-
-
-@contextmanager
-def storage_errors(name: str) -> Iterator[None]:
-    """Tell a failure of the storage in one line: it is full, damaged, or cannot be reached."""
-    try:
-        yield
-    except (SQLAlchemyError, StorageInternalError, ImportError, json.JSONDecodeError) as error:
-        cause: BaseException = error
-        while cause.__cause__ is not None:  # the database's own words
-            cause = cause.__cause__
-        reason = one_line(cause)
-        raise UserError(f"{name}: {reason}; finished work is kept") from error
-
-
-# --- doing them -----------------------------------------------------------------------------------
-
-
-@dataclass
-class _UnderWay:
-    """A trial that has begun."""
-
-    trial: Trial  # Optuna's trial
-    to_do: list[PlannedRun]  # runs that have not begun, in order
-    n_reported: int  # number of values that it has reported, also before it was interrupted
-    runs: dict[int, RunOutcome] = field(default_factory=dict)  # by seed
-    n_running: int = 0
-    is_over: bool = False  # whether further results are ignored
-
-
-class Trials:
-    """Hands out the runs of a search one by one, and ends trials by their results.
-
-    Args:
-        search: the search.
-        tell: called with the number of each trial that ends, its value (None if it was pruned or
-            failed), and the reason of a failure.
-        deadline: no run begins after this time (`time.monotonic`).
-    """
-
-    def __init__(
-        self,
-        search: Search,
-        tell: Callable[[int, float | None, str], None],
-        deadline: float = math.inf,
-    ) -> None:
-        self.search, self.tuning = search, search.tuning
-        self.tell, self.deadline = tell, deadline
-        self._trials: list[_UnderWay] = []
-        # Trials that wait for a run, by its folder: trials with equal settings share it.
-        self._waiting: dict[Path, list[_UnderWay]] = {}
-        self._failures: list[str] | None = []  # since the start; None after a success
-
     def next_run(self) -> PlannedRun | None:
         """The next run to do, or None while there is none.
 
         Trials are preferred of which no run is under way; at the end, seeds run side by side.
         """
         while time.monotonic() < self.deadline:
-            idle = next((each for each in self._trials if each.to_do and not each.n_running), None)
-            chosen = idle or self._begun() or self._least_busy()
+            open_ones = [each for each in self._trials if each.to_do]
+            idle = next((each for each in open_ones if not each.n_running), None)
+            busy = min(open_ones, key=lambda each: each.n_running, default=None)
+            chosen = idle or self._begun() or busy
             if chosen is None:
                 return None
             run = chosen.to_do.pop(0)
             waiting = self._waiting.setdefault(run.path, [])
             waiting.append(chosen)
             chosen.n_running += 1
-            if len(waiting) > 1:
-                continue
-            if not run.is_finished:
+            if len(waiting) == 1 and not run.is_finished:
                 return run
-            self.ended(run, "")  # by an equal trial, or before an interruption
+            if len(waiting) == 1:
+                self.ended(run, "")  # by an equal trial, or before an interruption
         return None
 
     def ended(self, run: PlannedRun, failure: str) -> None:
@@ -328,27 +207,20 @@ class Trials:
             if not each.is_over:
                 self._note(each, run, failure)
 
-    def _least_busy(self) -> _UnderWay | None:
-        open_ones = [each for each in self._trials if each.to_do]
-        return min(open_ones, key=lambda each: each.n_running, default=None)
-
     def _begun(self) -> _UnderWay | None:
         """Begin another trial, if there is one to do, or take one up again."""
-        study = self.search.study
-        while not self.search.is_saturated:
-            trials = self.search.trials
+        while not self.is_saturated:
+            trials = self.trials
             if all(trial.state != TrialState.WAITING for trial in trials):
-                if len(trials) == self.search.n_trials:
+                if len(trials) == self.n_trials:
                     return None
-                study.enqueue_trial(self.search.suggestions.params(len(trials)))
-            trial = study.ask()
-            entry = self.search.suggestions.entry(trial)
-            trial.set_user_attr(SETTINGS, plain(entry))
-            reported = study.get_trials(deepcopy=False)[trial.number].intermediate_values
-            new = _UnderWay(trial, [], len(reported))
+                self.study.enqueue_trial(self.suggestions.params(len(trials)))
+            new = _UnderWay(self.study.ask())
+            entry = self.suggestions.entry(new.trial)
+            new.trial.set_user_attr(SETTINGS, plain(entry))
             self._trials.append(new)
             try:
-                new.to_do = planned_runs(self.tuning, self.search.root, entry)
+                new.to_do = planned_runs(self.tuning, self.root, entry)
                 return new
             except UserError as error:
                 self._fail(new, str(error))
@@ -365,14 +237,34 @@ class Trials:
             return
         self._failures = None
         value = self.tuning.value([one.figure for one in each.runs.values()])
-        if len(each.runs) > each.n_reported:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a step reported before a kill
             each.trial.report(value, len(each.runs))
         each.trial.set_user_attr(RUNS, {str(k): asdict(one) for k, one in each.runs.items()})
-        number = each.trial.number
         if len(each.runs) == len(self.tuning.seeds):
             self._end(each, value)
-        elif number and self.search.is_hopeless(number, each.runs):
+        elif each.trial.number and self._is_hopeless(each):
             self._end(each, None)
+
+    def _is_hopeless(self, each: _UnderWay) -> bool:
+        """Whether a trial can no longer be the best, by its seeds so far."""
+        sign = -1.0 if self.tuning.is_cost else 1.0  # costs change their sign: higher is better
+
+        def scores(runs: Mapping[int, RunOutcome]) -> dict[int, float]:
+            return {seed: sign * run.figure for seed, run in runs.items()}
+
+        # A score of 1 is the optimum. Without a known optimum, figures are returns, for which 1
+        # means nothing.
+        are_scores = any(run.name == "score" for run in each.runs.values())
+        others = [trial for trial in self.trials if trial.number != each.trial.number]
+        return is_hopeless(
+            scores(each.runs),
+            [scores(outcomes_of(trial)) for trial in others],
+            self.tuning.pruner,
+            lambda values: sign * self.tuning.value([sign * value for value in values]),
+            n_seeds=len(self.tuning.seeds),
+            ceiling=1.0 if are_scores else -math.inf,
+        )
 
     def _fail(self, each: _UnderWay, reason: str) -> None:
         """End a trial with a failed run; samplers treat it as one of the worst."""
@@ -386,7 +278,83 @@ class Trials:
     def _end(self, each: _UnderWay, value: float | None, reason: str = "") -> None:
         """End a trial; without a value if it was pruned or failed."""
         state = TrialState.PRUNED if value is None else TrialState.COMPLETE
-        self.search.study.tell(each.trial, value, state)
+        self.study.tell(each.trial, value, state)
         each.is_over = True
         self._trials.remove(each)
         self.tell(each.trial.number, value, reason)
+
+
+# --- opening it ----------------------------------------------------------------------------------
+
+
+def open_search(tuning: TuningSpec, root: Path, url: str | None = None) -> Search:
+    """Check a search, and open or create its trials.
+
+    Args:
+        tuning: the search.
+        root: its folder, which is locked by this process.
+        url: a database of trials, such as ``sqlite:///FILE``; None for one in the folder.
+
+    Raises:
+        UserError: if the search cannot be done, or the storage has another one of this name.
+    """
+    run, agent = shipped_run(tuning, root), tuning.agent
+    if tuning.figure == AUTO:
+        is_bandit = ALGORITHMS[agent.algo].for_bandits
+        tuning = replace(tuning, figure="regret" if is_bandit else "score")
+    space = read_search_space(agent.algo, tuning.environment.env_id, tuning.search_space)
+    suggestions = Suggestions(tuning, space, shipped_entry(run.spec))
+    if not suggestions.n_free:
+        raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
+    suggestions.check(root)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    with storage_errors(url or str(root / OWN_FILE)):
+        study = optuna.create_study(
+            study_name=tuning.study.name,
+            storage=open_storage(root, url),
+            sampler=SeededSampler(tuning),
+            pruner=optuna.pruners.NopPruner(),  # `tuning.pruning` decides
+            direction="minimize" if tuning.is_cost else "maximize",
+            load_if_exists=True,
+        )
+    ranges = suggestions.space.distributions
+    as_json = {name: distribution_to_json(kind) for name, kind in ranges.items()}
+    asked = tuning.identity(suggestions.shipped, as_json)
+    if url is not None:  # the folder's lock is the only one
+        asked["folder"] = str(root.absolute())
+    before = study.user_attrs.get(ASKED, asked)
+    if changed := [key for key in asked if before.get(key) != asked[key]]:
+        was = "; ".join(
+            f"{key}: {shown(before.get(key))} there, {shown(asked[key])} now" for key in changed[:3]
+        )
+        raise UserError(
+            f"{tuning.study.name}: the search there is another ({was}): --name NAME makes one of "
+            "its own"
+        )
+    study.set_user_attr(ASKED, asked)
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        # Its process is gone, since this one holds the folder: Optuna hands the trial out again.
+        study._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+    return Search(tuning, root, study, suggestions)
+
+
+def open_storage(root: Path, url: str | None) -> BaseStorage:
+    """Open a storage of trials, see `open_search`."""
+    if url is not None:
+        return RDBStorage(url.replace("{", "{{").replace("}", "}}"))  # Optuna replaces braces
+    # Opened by path, because in a URL some characters have another meaning.
+    path = root / OWN_FILE
+    connect = partial(sqlite3.connect, path, SECONDS_TO_WAIT, check_same_thread=False)
+    return RDBStorage(f"sqlite:///{OWN_FILE}", engine_kwargs={"creator": connect})
+
+
+@contextmanager
+def storage_errors(name: str) -> Iterator[None]:
+    """Tell a failure of the storage in one line: it is full, damaged, or cannot be reached."""
+    try:
+        yield
+    except (SQLAlchemyError, StorageInternalError, ImportError) as error:  # or has no driver here
+        cause: BaseException = error
+        while cause.__cause__ is not None:  # the database's own words
+            cause = cause.__cause__
+        raise UserError(f"{without_secret(name)}: {one_line(cause)}") from error

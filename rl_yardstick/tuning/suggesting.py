@@ -14,7 +14,7 @@ import math
 import random
 import warnings
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -39,33 +39,53 @@ from rl_yardstick.tuning.dimensions import spread
 from rl_yardstick.tuning.search_spaces import SearchSpace, corners
 from rl_yardstick.tuning.tuning_spec import TuningSpec
 
-# Values of each number in the finest grid.
-MOST_VALUES = 100
-# The largest grid, so that a grid of many parameters is refused before it fills the memory.
-MOST_POINTS = 1_000_000
+# Points of the largest grid, which must fit into memory, and its values of one number.
+MOST_POINTS, MOST_VALUES = 1_000_000, 100
 
 
 class SeededSampler(BaseSampler):
-    """Makes a new sampler for each trial, and for each independently drawn parameter."""
+    """A new sampler of Optuna for each trial, and for each independently drawn parameter.
 
-    def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
-        self._make, self._seed = make, seed
+    Options are explicit although they are Optuna 5's defaults, because Optuna 5 changed them. TPE
+    draws parameters jointly (``multivariate``), conditional ones together with others of the same
+    condition (``group``), and treats running trials as bad ones (``constant_liar``), so that
+    parallel trials do not try the same settings. A grid has fixed trials, and ignores its sampler.
+    """
+
+    def __init__(self, tuning: TuningSpec) -> None:
+        self._tuning = tuning
 
     def _made(self, *numbers: int) -> BaseSampler:
-        seeds = np.random.SeedSequence([self._seed, *numbers])
-        return self._make(int(seeds.generate_state(1)[0]))
+        seeds = np.random.SeedSequence([self._tuning.seed, *numbers])
+        seed, n_startup = int(seeds.generate_state(1)[0]), self._tuning.n_startup_trials
+        if self._tuning.sampler == "tpe":
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ExperimentalWarning)  # of ``group``, since 2.8
+                return TPESampler(
+                    seed=seed,
+                    n_startup_trials=n_startup,
+                    n_ei_candidates=24,
+                    multivariate=True,
+                    group=True,
+                    constant_liar=True,
+                )
+        if self._tuning.sampler == "gp":
+            return GPSampler(
+                seed=seed,
+                n_startup_trials=n_startup,
+                independent_sampler=RandomSampler(seed=seed),
+                deterministic_objective=False,
+                warn_independent_sampling=False,
+            )
+        return RandomSampler(seed=seed)
 
-    def infer_relative_search_space(
-        self, study: Study, trial: FrozenTrial
-    ) -> dict[str, BaseDistribution]:
+    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, Any]:
         # Optuna calls this first; the sampler is kept for the second call.
         self._sampler = self._made(trial.number)
         return self._sampler.infer_relative_search_space(study, trial)
 
-    def sample_relative(
-        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
-    ) -> dict[str, Any]:
-        return self._sampler.sample_relative(study, trial, search_space)
+    def sample_relative(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        return self._sampler.sample_relative(*args, **kwargs)
 
     def sample_independent(
         self,
@@ -79,31 +99,6 @@ class SeededSampler(BaseSampler):
         return sampler.sample_independent(study, trial, param_name, param_distribution)
 
 
-def make_sampler(tuning: TuningSpec) -> BaseSampler:
-    """Make the sampler of a search; a grid has fixed trials, and ignores its sampler.
-
-    Options are explicit although they are Optuna 5's defaults, because Optuna 5 changed them. TPE
-    draws parameters jointly (``multivariate``), conditional ones together with others of the same
-    condition (``group``), and treats running trials as bad ones (``constant_liar``), so that
-    parallel trials do not try the same settings.
-    """
-    n_startup = {"n_startup_trials": tuning.n_startup_trials}
-
-    def make(seed: int) -> BaseSampler:
-        if tuning.sampler == "tpe":
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", ExperimentalWarning)  # of ``group``, since 2.8
-                options = dict.fromkeys(("multivariate", "group", "constant_liar"), True)
-                return TPESampler(seed=seed, n_ei_candidates=24, **n_startup, **options)
-        if tuning.sampler == "gp":
-            drawn = RandomSampler(seed=seed)
-            options = dict.fromkeys(("deterministic_objective", "warn_independent_sampling"), False)
-            return GPSampler(seed=seed, independent_sampler=drawn, **n_startup, **options)
-        return RandomSampler(seed=seed)
-
-    return SeededSampler(make, tuning.seed)
-
-
 class Suggestions:
     """Suggests hyperparameters for each trial; ``shipped`` includes the user's fixed settings."""
 
@@ -111,17 +106,14 @@ class Suggestions:
         self.tuning, self.shipped = tuning, dict(shipped)
         # The space, widened if necessary, and the parameters of the first trial.
         self.space, self.first = space.including(self.shipped)
-        self._fixed = self._settled()
-        self.fits_batches = self._fits_batches()
-
-    def _settled(self) -> dict[str, Any]:
-        """The parameters of settings that the user has fixed."""
-        given = set(self.tuning.agent.settings)
+        # The parameters of settings that the user has fixed.
+        given = set(tuning.agent.settings)
         dimensions = [each for each in self.space.entries.values() if given.issuperset(each.keys)]
         names = [name for each in dimensions for name in each.distributions]
-        return {name: self.first[name] for name in names if name in self.first}
+        self._fixed = {name: self.first[name] for name in names if name in self.first}
 
-    def _fits_batches(self) -> bool:
+    @cached_property
+    def fits_batches(self) -> bool:
         """Whether trials sample sizes of batches or buffers, and the agent splits its buffer."""
         from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
@@ -139,18 +131,17 @@ class Suggestions:
     @cached_property
     def grid(self) -> list[dict[str, Any]]:
         """The points of the finest grid with fewer points than trials, in random order."""
-        n_trials, found = self.tuning.n_trials - 1, self._points(2)
-        if len(found) > n_trials:
+        n_trials, found = self.tuning.n_trials, self._points(2)
+        if len(found) >= n_trials:
             raise UserError(
                 f"--sampler grid: {len(found):,} settings with two values of each number, beside "
-                f"the shipped ones, and --trials says {self.tuning.n_trials:,}: give more trials "
-                "or a smaller --search-space"
+                f"the shipped ones, and --trials says {n_trials:,}: give more trials or a smaller "
+                "--search-space"
             )
-        for n in range(3, MOST_VALUES + 1):
+        finer, n = self._points(3), 3
+        while len(found) < len(finer) < n_trials and n < MOST_VALUES:
+            found, n = finer, n + 1
             finer = self._points(n)
-            if not len(found) < len(finer) <= n_trials:
-                break
-            found = finer
         random.Random(self.tuning.seed).shuffle(found)  # noqa: S311  # an order, and no secret
         return found
 

@@ -28,7 +28,6 @@ FIGURES = ("score", *METRICS, *COST_OF_THRESHOLD)
 CHEAPER_IS_BETTER = (*COSTS, *COST_OF_THRESHOLD)
 
 AUTO, SHIPPED = "auto", "shipped"
-LOWER = 0.25
 # What may differ when a search continues: its length, and all about the re-test.
 _MAY_CHANGE = {"study", "n_trials", "retest", "retest_seeds", "first_retest_seed", "until_decided"}
 _MAY_CHANGE |= {"max_retest_seeds"}
@@ -44,7 +43,7 @@ class TuningSpec:
     study: StudySpec
     n_trials: int = 100  #: number of settings to try
     figure: str = AUTO  #: one of `FIGURES`; or `AUTO`, until the kind of runs is known
-    objective: Objective = "mean"  #: the value of a setting over its seeds, see `judged`
+    objective: Objective = "mean"  #: the value of a setting over its seeds, see `value`
     sampler: Sampler = "tpe"  #: the sampler of settings
     pruner: str = "auto"  #: the rule that ends trials early
     n_startup_trials: int = 10  #: random trials before the sampler learns
@@ -82,11 +81,6 @@ class TuningSpec:
         order = np.random.default_rng(self.seed).permutation(self.study.n_seeds)
         return tuple(self.study.first_seed + int(place) for place in order)
 
-    @property
-    def held_out(self) -> range:
-        """The held-out seeds of the re-test."""
-        return range(self.first_retest_seed, self.first_retest_seed + self.retest_seeds)
-
     def searched(self, entry: Mapping[str, Any]) -> dict[str, Any]:
         """Settings for runs of the search, which may use another engine than the agent's own.
 
@@ -97,72 +91,56 @@ class TuningSpec:
         return {**({"engine": "auto"} if "auto" in engines[1:] else {}), **entry}
 
     def value(self, figures: Sequence[float] | Floats) -> float:
-        """The value of a setting by the figures of its runs."""
-        return judged(figures, self.objective, is_cost=self.is_cost)
+        """The value of a setting by the figures of its runs, at least one.
+
+        It is their mean, or with the objective ``iqm`` the mean of the middle half, with ``lower``
+        the quartile on the side of the worst runs.
+        """
+        values = np.sort(np.asarray(figures, np.float64))
+        if self.objective == "lower":
+            return float(np.quantile(values, 0.75 if self.is_cost else 0.25))
+        cut = len(values) // 4 if self.objective == "iqm" else 0
+        return float(values[cut : len(values) - cut].mean())
 
     def check(self) -> None:
         """Check that search and re-test share no seeds, and that a re-test can grow."""
-        held_out = self.held_out
+        from rl_yardstick.experiments.growing import MOST_SEEDS
+
+        most = least = self.retest_seeds
         if self.until_decided:
-            held_out = range(held_out.start, held_out.start + self._most_seeds())
+            if not self.retest:
+                raise UserError("--until-decided is about the re-test: leave out --retest 0")
+            if not self.is_judged_by_study:
+                raise UserError(
+                    "--until-decided decides means of scores, returns or regrets: leave it out, or "
+                    f"--objective {self.objective} --metric {self.figure}"
+                )
+            most = self.max_retest_seeds or max(MOST_SEEDS, least)
         elif self.max_retest_seeds is not None:
             raise UserError("--max-retest-seeds belongs to --until-decided: give both")
-        shared = sorted(set(self.seeds) & set(held_out))
+        if most < least:
+            raise UserError(f"--max-retest-seeds is {most}, the re-test begins with {least} seeds")
+        held_out = range(self.first_retest_seed, self.first_retest_seed + most)
+        shared = sorted(seed for seed in self.seeds if seed in held_out)
         if self.retest and shared:
             raise UserError(
                 f"seed {shared[0]} is one of the search and of the re-test: what is chosen by its "
                 "seeds is judged on others; see --first-seed and --first-retest-seed"
             )
 
-    def _most_seeds(self) -> int:
-        """The most seeds of a re-test that grows until it is decided; checks that it can."""
-        from rl_yardstick.experiments.growing import MOST_SEEDS
-
-        if not self.retest:
-            raise UserError("--until-decided is about the re-test: leave out --retest 0")
-        if not self.is_judged_by_study:
-            raise UserError(
-                "--until-decided decides means of scores, returns or regrets: leave it out, or "
-                f"--objective {self.objective} --metric {self.figure}"
-            )
-        most = self.max_retest_seeds or max(MOST_SEEDS, self.retest_seeds)
-        if most < (least := self.retest_seeds):
-            raise UserError(f"--max-retest-seeds is {most}, the re-test begins with {least} seeds")
-        return most
-
     def identity(self, shipped: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, Any]:
         """What must be the same when a search continues, as JSON."""
-        entry, study = self.searched(shipped), self.study
-        found = {
+        of_runs = ("n_seeds", "first_seed", "eval_freq", "eval_episodes", "threshold")
+        found: dict[str, Any] = {
             **{key: value for key, value in vars(self).items() if key not in _MAY_CHANGE},
-            **({"search_engine": entry["engine"]} if entry.keys() - shipped.keys() else {}),
+            **{key: getattr(self.study, key) for key in of_runs},
             "algo": self.agent.algo,
             "env": self.environment.env_id,
             "hyperparams": dict(shipped),
-            "first_seed": study.first_seed,
-            "seeds_per_trial": study.n_seeds,
-            "eval_freq": study.eval_freq,
-            "eval_episodes": study.eval_episodes,
-            "threshold": study.threshold,
+            "search_engine": self.searched(shipped).get("engine"),
             "search_space": dict(space),
         }
         return dict(plain(found))
-
-
-def judged(figures: Sequence[float] | Floats, objective: Objective, *, is_cost: bool) -> float:
-    """The value of a setting by its runs.
-
-    Args:
-        figures: the figures of its runs, at least one.
-        objective: ``mean``; ``iqm``, the mean of the middle half; ``lower``, the quartile on the
-            side of the worst runs.
-        is_cost: whether a lower figure is better; ``lower`` is then the upper quartile.
-    """
-    values = np.sort(np.asarray(figures, np.float64))
-    if objective == "lower":
-        return float(np.quantile(values, 1 - LOWER if is_cost else LOWER))
-    cut = len(values) // 4 if objective == "iqm" else 0
-    return float(values[cut : len(values) - cut].mean())
 
 
 def without_secret(text: str) -> str:

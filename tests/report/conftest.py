@@ -30,8 +30,7 @@ def watched(tmp_path_factory):
     return done
 
 
-# As Optuna writes them.
-SEARCH_SPACE = {
+SPACE = {
     "rate": ("Float", {"step": None, "low": 0.01, "high": 1.0, "log": True}),
     "kind": ("Categorical", {"choices": ["a", None, True]}),
     "steps": ("Int", {"step": 1, "low": 1, "high": 5, "log": False}),
@@ -43,21 +42,19 @@ def tuning_trial():
     """Makes up a trial."""
 
     def trial(number, value, figures, state="complete", failure=None, **params):
+        at = f"2026-01-01T00:{{:02d}}:{number % 60:02d}"
+        more = {"tau": 1.0} if number == 2 else {}
         return {
             "number": number,
             "state": state,
             "value": value,
+            "failure": failure,
             "params": {"rate": 0.1, "kind": "a", "steps": 3} | params,
-            "settings": {
-                "learning_rate": number,
-                "gamma": 0.9,
-                **({"tau": 1.0} if number == 2 else {}),
-            },
+            "settings": {"learning_rate": number, "gamma": 0.9, **more},
             "figures": figures,
             "seconds": 2.0 * len(figures),
-            "failure": failure,
-            "began": f"2026-01-01T00:00:{number % 60:02d}",
-            "ended": f"2026-01-01T00:01:{number % 60:02d}",
+            "began": at.format(0),
+            "ended": at.format(1),
         }
 
     return trial
@@ -65,21 +62,22 @@ def tuning_trial():
 
 @pytest.fixture
 def tuning_record(tuning_trial):
-    """What a tuning wrote down, made up."""
-    retested = {"held_out": 0.5, "verdict": "", "in_search": 0.6, "number": 0}
-    retested |= {"n_runs": 4, "n_failed": 1}
-    retested["interval"] = {"point": 0.5, "low": 0.4, "high": 0.6, "n": 4, "n_missing": 0}
-    winner = {**retested, "label": "trial 2", "number": 2, "held_out": 0.7}
-    winner |= {"verdict": "better so far"}
+    """What a tuning wrote down, made up; distributions are as Optuna writes them."""
     space = {
         name: json.dumps({"name": f"{kind}Distribution", "attributes": attributes})
-        for name, (kind, attributes) in SEARCH_SPACE.items()
+        for name, (kind, attributes) in SPACE.items()
     }
+    interval = {"point": 0.5, "low": 0.4, "high": 0.6, "n": 4, "n_missing": 0}
+    shipped = {"label": "shipped", "number": 0, "held_out": 0.5, "in_search": 0.6, "verdict": ""}
+    shipped |= {"n_runs": 4, "n_failed": 1, "interval": interval}
+    winner = shipped | {"label": "trial 2", "number": 2, "held_out": 0.7}
+    winner |= {"verdict": "better so far"}
     asked = {"algo": "dqn", "env": "Toy-v0", "sampler": "tpe", "pruner": "auto"}
+    retest = {"settings": [shipped, winner], "winner": "trial 2", "winner_file": "winner.yml"}
     return {
         "name": "t",
         "command": "python tune.py <script>",
-        "asked": {**asked, "search_space": space},
+        "widened": ["rate"],
         "figure": "score",
         "objective": "mean",
         "lower_is_better": False,
@@ -87,7 +85,7 @@ def tuning_record(tuning_trial):
         "n_at_optimum": 0,
         "seeds": [1, 0],
         "held_out_seeds": [1000, 1001],
-        "widened": ["rate"],
+        "asked": {**asked, "search_space": space},
         "trials": [
             tuning_trial(0, 0.6, {"1": 0.6, "0": 0.6}),
             tuning_trial(1, -30.0, {"1": -30.0}, "pruned", rate=1.0),
@@ -97,11 +95,5 @@ def tuning_record(tuning_trial):
             tuning_trial(5, None, {}, "running"),
             tuning_trial(6, 0.75, {"1": 0.75}, "pruned", kind=True),
         ],
-        "retest": {
-            "settings": [{**retested, "label": "shipped"}, winner],
-            "winner": "trial 2",
-            "winner_file": "winner.yml",
-            "reason": "",
-            "optimism": 0.1,
-        },
+        "retest": {**retest, "reason": "", "optimism": 0.1},
     }

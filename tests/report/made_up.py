@@ -79,14 +79,9 @@ def environment(agents=(), label="lake", **changes):
 
 
 def study(labels, metric="final", places=("lake",), n_seeds=4):
-    return StudySpec(
-        "s",
-        "S",
-        tuple(AgentSpec(label, "qlearning", tuned=False) for label in labels),
-        tuple(EnvironmentSpec(place, "FrozenLake-v1") for place in places),
-        n_seeds=n_seeds,
-        metric=metric,
-    )
+    agents = tuple(AgentSpec(label, "qlearning", tuned=False) for label in labels)
+    environments = tuple(EnvironmentSpec(place, "FrozenLake-v1") for place in places)
+    return StudySpec("s", "S", agents, environments, n_seeds=n_seeds, metric=metric)
 
 
 def analysis(environments, labels, root=None, pulls=None, overall=None, cpu=(), **fields):
@@ -106,6 +101,7 @@ def analysis(environments, labels, root=None, pulls=None, overall=None, cpu=(), 
 def pulls(start, n=(1, 10, 100), n_runs=4):
     """What a bandit's agent did: figures that begin with ``start``, each ten above the last."""
     rise, nothing = start + np.arange(float(len(n))), np.empty(0)
+    unknown = ("shares", "context_regret", "estimates", "estimates_std", "true_means", "posteriors")
     return PullStatistics(
         pulls=np.array(n),
         reward=rise,
@@ -117,11 +113,6 @@ def pulls(start, n=(1, 10, 100), n_runs=4):
         simple_regret=rise + 30,
         total_reward=np.zeros(n_runs),
         total_regret=np.zeros(n_runs),
-        shares=nothing,
-        context_regret=nothing,
-        estimates=nothing,
-        estimates_std=nothing,
-        true_means=nothing,
         moments=np.empty(0, dtype=np.int64),
-        posteriors=nothing,
+        **dict.fromkeys(unknown, nothing),
     )

@@ -95,22 +95,18 @@ def test_settings_say_how_it_was_done_and_what_failed_and_not_where(page, report
     assert re.search(r"on Warehouse-v0, seed 1:\s+ValueError: <the> disk & all is full", settings)
 
 
-# --- data of the figures --------------------------------------------------------------------------
-
-
 def test_curves_end_with_the_final_evaluations_and_stand_in_a_table_too(page, report_study):
     summary = report_study.analysis.results.curves
+    summary = summary[summary["kind"] == "evaluation"]
     tables = [text for _, text in page.all("details") if "as a table" in text]
-    for place, (name, table) in enumerate(
-        zip(("FrozenLake-v1", "Warehouse-v0"), tables, strict=True)
-    ):
+    for place, name in enumerate(("FrozenLake-v1", "Warehouse-v0")):
+        assert re.findall(r"\d+ %", tables[place]) == ["10 %", "25 %", "50 %", "100 %"]
         curves = page.data(f"data-curves-{place}")["evaluation"]["by_axis"]["step"]
-        assert re.findall(r"\d+ %", table) == ["10 %", "25 %", "50 %", "100 %"]
         for agent, curve in curves.items():
             rows = summary[(summary["agent"] == agent) & (summary["environment"] == name)]
-            last = rows[rows["kind"] == "evaluation"].groupby("seed")["value"].last().mean()
+            last = rows.groupby("seed")["value"].last().mean()
             assert curve["y"][-1] == pytest.approx(last, rel=1e-4)
-            row = table[table.index(agent) + len(agent) :].replace(",", "")
+            row = tables[place].partition(agent)[2].replace(",", "")
             cells = re.findall(r"(\S+)\s+(?:\S+ to \S+ )?(\d+) steps", row)[:4]
             means, steps = np.array(cells, dtype=float).T
             assert steps.tolist() == [200, 500, 1000, 2000]
@@ -135,23 +131,17 @@ def test_the_maps_are_those_of_the_run_folders(page, report_study):
     assert data["matters"] == "1111101011100110"
 
 
-# --- films ----------------------------------------------------------------------------------------
-
-
-def test_a_film_is_small_and_made_once_but_anew_where_it_is_none(report_study):
+def test_a_film_is_small_and_made_once(report_study):
     from PIL import Image
 
-    run = report_study.planned[0]
-    film = film_of(run)
-    before, content = film.stat().st_mtime_ns, film.read_bytes()
-    assert film_of(run) == film
+    film = film_of(report_study.planned[0])
+    before = film.stat().st_mtime_ns
+    assert film_of(report_study.planned[0]) == film
     assert film.stat().st_mtime_ns == before
-    assert len(content) <= 2 * MAX_BYTES
+    assert film.stat().st_size <= 2 * MAX_BYTES
     with Image.open(film) as picture:
         assert max(picture.size) <= MAX_SIDE
         assert picture.n_frames > 1
-    (run.path / "episode.gif").write_text("GIF89a")
-    assert film_of(run).read_bytes() == content
 
 
 # --- nothing gets in, nothing gets out ------------------------------------------------------------
@@ -210,9 +200,6 @@ def test_a_sweep_and_a_heat_map_stand_on_top_with_their_best_value(tmp_path):
         "80": "--strength: 45%",
         "70": "--strength: 0%",
     }
-
-
-# --- critics and gradients ------------------------------------------------------------------------
 
 
 def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_study):

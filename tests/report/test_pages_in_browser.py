@@ -121,9 +121,6 @@ def browser(tmp_path_factory):
     found.driver.quit()
 
 
-# --- a study --------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def page(browser, report_study):
     """Freshly loaded in a wide window, all figures drawn."""
@@ -192,9 +189,6 @@ def test_nothing_lies_beyond_the_edge_of_a_phone(browser, report_study):
         browser.select("#environment", environment)
         time.sleep(0.3)
         browser.fits(320)
-
-
-# --- a search -------------------------------------------------------------------------------------
 
 
 def test_the_page_of_a_search_draws_and_fits_a_telephone(browser, tuning_record, tmp_path):

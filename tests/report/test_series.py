@@ -60,14 +60,19 @@ def lake():
 def test_mean_curves_the_best_agent_first(lake):
     curves = learning_curves(*lake)
     assert list(curves) == ["evaluation", "training"]
-    by_step = curves["evaluation"].by_axis["step"]
-    assert list(by_step) == ["b", "a"]
-    assert (by_step["a"].x.tolist(), by_step["a"].y.tolist()) == ([10, 20], [2, 6])
-    assert (by_step["b"].y.tolist()) == [2, 8]
-    assert (by_step["a"].low < by_step["a"].y).all()
-    assert (by_step["a"].high > by_step["a"].y).all()
-    assert curves["evaluation"].by_axis["episode"]["a"].x.tolist() == [1, 2]
-    assert curves["evaluation"].by_axis["seconds"]["a"].x.tolist() == [0.1, 0.2]
+    shown = {
+        by: {name: (curve.x.tolist(), curve.y.tolist()) for name, curve in of_agents.items()}
+        for by, of_agents in curves["evaluation"].by_axis.items()
+    }
+    assert list(shown["step"]) == ["b", "a"]
+    assert shown == {
+        "step": {"b": ([10, 20], [2, 8]), "a": ([10, 20], [2, 6])},
+        "episode": {"b": ([1, 2], [2, 8]), "a": ([1, 2], [2, 6])},
+        "seconds": {"b": ([0.1, 0.2], [2, 8]), "a": ([0.1, 0.2], [2, 6])},
+    }
+    of_two = curves["evaluation"].by_axis["step"]["a"]
+    assert (of_two.low < of_two.y).all()
+    assert (of_two.high > of_two.y).all()
     assert list(curves["training"].by_axis["step"]) == ["b"]
     # Each kind has a scale of its own; that of the other is the optimum.
     assert (curves["evaluation"].linear_up_to, curves["training"].linear_up_to) == (None, 100)
@@ -95,15 +100,18 @@ def test_runs_with_a_figure_by_seed(lake):
     assert found == [("b", [0], [8], 90), ("a", [0, 2], [4, 6], 40)]
 
 
-def test_where_an_axis_ceases_to_be_linear():
-    for curves, optimum, expected in (
+@pytest.mark.parametrize(
+    ("curves", "optimum", "expected"),
+    [
         ([[-7900.0, -50.0, 70.0]], 79.0, 79.0),  # two decades beyond the optimum
         ([[-7899.0, -50.0, 70.0]], 79.0, None),
         ([[-300.0, 1.0, 2.0, 2.0]], None, 2.0),  # the end of the curve stands for the optimum
         ([[np.nan, 1.0], [np.nan]], None, None),
         ([[-99.0, 0.0]], 0.1, None),  # returns below one are never dwarfed by those below 100
-    ):
-        assert linear_up_to([np.array(curve) for curve in curves], optimum) == expected
+    ],
+)
+def test_where_an_axis_ceases_to_be_linear(curves, optimum, expected):
+    assert linear_up_to([np.array(curve) for curve in curves], optimum) == expected
 
 
 # --- sweeps ---------------------------------------------------------------------------------------

@@ -9,17 +9,8 @@ from dataclasses import replace
 
 import pytest
 
-from rl_yardstick.report.documents import (
-    MARKUPS,
-    headline,
-    latex_text,
-    markdown_text,
-    name_of,
-    processor_seconds,
-    ranking,
-    table_as,
-    verdicts_as,
-)
+from rl_yardstick.report import documents
+from rl_yardstick.report.documents import MARKUPS, headline, ranking, table_as
 from rl_yardstick.report.page import result_sections
 from rl_yardstick.report.page.frame import Report
 from rl_yardstick.report.ranking import COLUMNS, Row
@@ -42,8 +33,8 @@ def lake(**changes):
     return made_up.environment(**{"agents": agents[::-1], "best": best, **changes})
 
 
-def of_lake(cpu=(), metric="final", **changes):
-    return made_up.analysis([lake(**changes)], NAMES, cpu=cpu, metric=metric)
+def of_lake(cpu=(), **changes):
+    return made_up.analysis([lake(**changes)], NAMES, cpu=cpu)
 
 
 # --- Markdown and LaTeX ---------------------------------------------------------------------------
@@ -66,7 +57,7 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
         "| `first` | **0.9** (40 s) |",
     ]
     assert legend == LEGEND
-    assert processor_seconds(of_lake(cpu=CPU).results) == {
+    assert documents.processor_seconds(of_lake(cpu=CPU).results) == {
         ("first", "lake"): 40.4,
         ("same", "lake"): 0.1249,
     }
@@ -96,19 +87,19 @@ def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_foo
     assert not any("†" in said for said in conclusion(found.study, other).everything)
 
 
-SAFE = [
-    (latex_text, r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
-    (latex_text, "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
-    (latex_text, "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
-    (latex_text, "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
-    (markdown_text, "a|b <b>*x*</b> [x](y) `c`", "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"),
-    (name_of, "a`b|", "a\\`b\\|"),
-]
-
-
-def test_nothing_of_a_text_is_markup():
-    for escaped, text, safe in SAFE:
-        assert escaped(text) == safe
+@pytest.mark.parametrize(
+    ("form", "text", "safe"),
+    [
+        ("latex_text", r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
+        ("latex_text", "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
+        ("latex_text", "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
+        ("latex_text", "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
+        ("markdown_text", "a|b <b>*x*</b> [x](y) `c`", r"a\|b \<b\>\*x\*\</b\> [x\](y) \`c\`"),
+        ("name_of", "a`b|", r"a\`b\|"),
+    ],
+)
+def test_nothing_of_a_text_is_markup(form, text, safe):
+    assert getattr(documents, form)(text) == safe
 
 
 def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
@@ -116,7 +107,7 @@ def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
     agents = [made_up.agent(name, 90 - 10 * n) for n, name in enumerate(names)]
     pairs = (made_up.pair(names[0], names[1], "tied"),)
     found = made_up.analysis([made_up.environment(agents, "lake #1", pairs=pairs)], names)
-    text = verdicts_as("tex", found, "python compare.py 'a_b & 50%' --x")
+    text = documents.verdicts_as("tex", found, "python compare.py 'a_b & 50%' --x")
     plain = re.sub(r"\\[{}$&#%_]", "", text)
     assert plain.count("{") == plain.count("}")
     assert plain.count("$") % 2 == 0

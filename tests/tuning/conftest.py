@@ -1,24 +1,24 @@
 """A search whose runs take no time: what a setting comes to on a seed is a formula."""
 
-from collections import defaultdict
+import math
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from types import SimpleNamespace
 
 import pytest
 from optuna.storages import InMemoryStorage
-from rl_yardstick.tuning.trial_storage import TrialQueue, open_storage, open_study
 
+from rl_yardstick.experiments.pool import keep_busy
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.run import Stop
 from rl_yardstick.tuning import searching
-from rl_yardstick.tuning.search_spaces import read_search_space
-from rl_yardstick.tuning.searching import OpenTuning, RunOutcome, Search
-from rl_yardstick.tuning.suggesting import Suggestions, make_sampler
+from rl_yardstick.tuning.searching import RunOutcome, open_search
+from rl_yardstick.tuning.suggesting import name_of
 from rl_yardstick.tuning.tuning_spec import SHIPPED, TuningSpec
 
-SHIPPED_ENTRY = {"learning_rate": 0.5, "gamma": 0.9, "n_episodes": 10}
+ENTRY = {"n_episodes": 10, "learning_rate": 0.5, "gamma": 0.9}
 SPACE = """\
 default:
   learning_rate: {low: 0.01, high: 1.0, scale: log}
@@ -26,105 +26,91 @@ default:
 """
 
 
-def toy_tuning(**changes):
-    study = StudySpec(
-        name="toy",
-        title="toy",
-        agents=(AgentSpec(SHIPPED, "qlearning", changes.pop("settings", {})),),
-        environments=(EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1"),),
-        n_seeds=changes.pop("n_seeds", 3),
-    )
-    given = {"n_trials": 10, "figure": "score", "n_startup_trials": 4, "pruner": "none"}
-    return TuningSpec(study=study, **{**given, **changes})
-
-
-def opened(storages, tuning, root, storage=None):
-    """A driver's view of the toy; those of one folder share a storage in memory, or a real one.
-
-    A storage is named, or given.
-    """
-    root.mkdir(parents=True, exist_ok=True)
-    keeping = storages[root] if storage is None else storage
-    keeping = open_storage(root, keeping) if isinstance(keeping, str) else keeping
-    path = root / "space.yml"
-    path.write_text(SPACE)
-    space = read_search_space("qlearning", "FrozenLake-v1", path)
-    suggestions = Suggestions(tuning, space, SHIPPED_ENTRY)
-    asked = tuning.identity(SHIPPED_ENTRY, {})
-    study = open_study(tuning, root, keeping, make_sampler(tuning), asked)
-    queue = TrialQueue(study, root, suggestions.n_trials)
-    return OpenTuning(tuning, root, study, queue, suggestions)
-
-
 @dataclass
 class ToyRun:
+    """A planned run; finished ones are known by their folders."""
+
     entry: dict
     seed: int
-    is_finished: bool = False
+    path: str
+    finished: set
+
+    @property
+    def is_finished(self):
+        return self.path in self.finished
+
+    def recorded(self):
+        return {}
 
 
-class ToyLauncher:
-    """Does runs at once, until it is to break off."""
+class Toy:
+    """Searches in a folder; those of one folder share a storage in memory and finished runs."""
 
-    def __init__(self, n_workers=1, stops_after=None, failing=()):
-        self.n_workers, self.stops_after, self.failing = n_workers, stops_after, failing
-        self.done = []
+    shipped = ENTRY
 
-    def submit(self, planned):
-        if len(self.done) == self.stops_after:
-            raise KeyboardInterrupt
-        self.done.append(planned)
-        future = Future()
-        fails = planned.seed in self.failing
-        future.set_result(SimpleNamespace(reason="it broke", log=None) if fails else None)
-        return future
+    def __init__(self, folder, patch):
+        self.folder, self.storages, self.finished = folder, {}, {}
+        (folder / "space.yml").write_text(SPACE)
+        (folder / "entry.yml").write_text(f"FrozenLake-v1: {ENTRY}".replace("'", ""))
+        patch.setattr(searching, "planned_runs", self._planned)
+        patch.setattr(searching, "outcome_of", lambda _, run: self._outcome(run))
+        patch.setattr(searching, "open_storage", self._storage)
 
+    def tuning(self, **changes):
+        settings, path = changes.pop("settings", {}), self.folder / "entry.yml"
+        agent = AgentSpec(SHIPPED, "qlearning", settings, conf_file=path)
+        place = (EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1"),)
+        study = StudySpec("toy", "toy", (agent,), place, n_seeds=changes.pop("n_seeds", 3))
+        given = {"n_trials": 10, "figure": "score", "n_startup_trials": 4, "pruner": "none"}
+        return TuningSpec(study, **{**given, "search_space": self.folder / "space.yml", **changes})
 
-class Quiet:
-    def run_ended(self):
-        pass
+    def opened(self, tuning=None, name="it", storage=None):
+        root = self.folder / name
+        root.mkdir(exist_ok=True)
+        return open_search(tuning or self.tuning(), root, storage)
 
-    def trial_ended(self, number, value, reason):
-        pass
+    def search(self, search, n_workers=1, stops_after=None, failing=lambda run: False, **options):
+        """Do the runs, until the process is killed; returns those that were done."""
+        done = []
+        self.score = options.pop("score", score)
+        self.steps = options.pop("steps", lambda *_: None)
+
+        def submit(run, command):
+            if len(done) == stops_after:
+                raise KeyboardInterrupt
+            done.append(run)
+            future = Future()
+            if failing(run):
+                future.set_exception(UserError("it broke"))
+            else:
+                run.finished.add(run.path)
+                future.set_result(None)
+            return future
+
+        workers = SimpleNamespace(n_at_once=n_workers, timeout=None, submit=submit)
+        search.deadline = options.pop("deadline", math.inf)
+        with suppress(KeyboardInterrupt):
+            keep_busy(workers, search.next_run, search.ended, "", Stop())
+        return done
+
+    def _planned(self, tuning, root, entry):
+        finished = self.finished.setdefault(root, set())
+        return [ToyRun(entry, s, f"{name_of(entry)}/{s}", finished) for s in tuning.seeds]
+
+    def _storage(self, root, given):
+        return self.storages.setdefault(given or root, InMemoryStorage())
+
+    def _outcome(self, run):
+        value = self.score(run.entry, run.seed)
+        return RunOutcome(
+            value, 1.0, "score", self.steps(run.entry, run.seed) if value >= 1 else None
+        )
 
 
 def score(entry, seed):
     return 1.0 - abs(entry["learning_rate"] - 0.1) - abs(entry["gamma"] - 0.95) + 0.01 * seed
 
 
-def search(
-    monkeypatch, place, launcher, figure=score, judged_by="score", steps=lambda *_: None, **options
-):
-    def outcome_of(_, run):
-        value = figure(run.entry, run.seed)
-        found = steps(run.entry, run.seed) if value >= 1 else None
-        return RunOutcome(value, 1.0, judged_by, found)
-
-    monkeypatch.setattr(searching, "outcome_of", outcome_of)
-    with place.queue, suppress(KeyboardInterrupt):
-        Search(place, launcher, Quiet(), **options).run()
-    return launcher
-
-
-def states(place):
-    return [trial.state.name for trial in place.queue.trials()]
-
-
-def params(place):
-    return [trial.params for trial in place.queue.trials()]
-
-
 @pytest.fixture
-def toy(monkeypatch):
-    """All of this, with what does and judges runs replaced."""
-    monkeypatch.setattr(searching, "planned_run", lambda _, __, entry, seed: ToyRun(entry, seed))
-    return SimpleNamespace(
-        tuning=toy_tuning,
-        opened=partial(opened, defaultdict(InMemoryStorage)),
-        Launcher=ToyLauncher,
-        search=partial(search, monkeypatch),
-        score=score,
-        states=states,
-        params=params,
-        shipped=SHIPPED_ENTRY,
-    )
+def toy(tmp_path, monkeypatch):
+    return Toy(tmp_path, monkeypatch)

@@ -2,28 +2,26 @@
 
 import math
 from functools import cache
-from pathlib import Path
 
 import gymnasium as gym
 import optuna
 import pytest
 from optuna.trial import FixedTrial
-from rl_yardstick.pipeline.agent_settings import resolved_spec
-from rl_yardstick.pipeline.settings.components import build_algorithm_kwargs, default_policy
-from rl_yardstick.pipeline.settings.hyperparams import entry_names, read_hyperparams, split
-from rl_yardstick.pipeline.settings.yaml import read_yaml
 
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline import settings
+from rl_yardstick.pipeline.components import constructor_arguments
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.settings import hyperparams
+from rl_yardstick.pipeline.settings import entry_names, read_entry, read_spec, read_yaml
 from rl_yardstick.tuning import search_spaces
-from rl_yardstick.tuning.dimensions import same
+from rl_yardstick.tuning.dimensions import same, spread
 from rl_yardstick.tuning.search_spaces import corners, read_search_space
-from rl_yardstick.tuning.suggesting import Suggestions
+from rl_yardstick.tuning.searching import open_search
+from rl_yardstick.tuning.suggesting import Suggestions, shipped_entry
 from rl_yardstick.tuning.tuning_spec import TuningSpec
 
-FOLDER = Path(search_spaces.__file__).parents[1] / "hyperparams" / "search_spaces"
+FOLDER = settings.HYPERPARAMS / "search_spaces"
 NOTHING_TO_SEARCH = {"optimal", "random", "angle", "mabwiser_thompson"}
 SEARCHED = [name for name in ALGORITHMS if name not in NOTHING_TO_SEARCH]
 
@@ -47,26 +45,11 @@ Taxi-v4:
 """
 
 
-class Masked(gym.Env):
-    observation_space = gym.spaces.Discrete(2)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return 0, {}
-
-    def action_masks(self):
-        return [False, True]
-
-    def step(self, action):
-        return 1, 0.0, True, False, {}
-
-
 @pytest.fixture(scope="module", autouse=True)
 def files_read_once():
     """They hold a dozen entries each, and reading them is most of what these tests take."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (search_spaces, hyperparams):
+        for module in (search_spaces, settings):
             patch.setattr(module, "read_yaml", cache(read_yaml))
         yield
 
@@ -82,18 +65,15 @@ def read(tmp_path, text, env_id="Foo-v0", algo="dqn"):
     return read_search_space(algo, env_id, path)
 
 
-def as_run(algo, env_id):
-    """The entry with numbers for ``auto``, as a search begins with it."""
-    entry = read_hyperparams(algo, env_id)
-    return resolved_spec(entry, algo=algo, env_id=env_id, seed=0).saved_hyperparams
-
-
 def shipped(algo):
     """The entries of an agent's files, both of settings and of spaces, by environment."""
     names = [*entry_names(algo), *(set(read_yaml(FOLDER / f"{algo}.yml")) - {"default"})]
-    names = list(dict.fromkeys(names))
-    entries = {name: as_run(algo, name) for name in names}
-    return {**entries, "Unknown-v0": read_hyperparams(algo, "Unknown-v0")}
+    return {name: as_run(algo, name) for name in dict.fromkeys([*names, "FrozenLake-v1"])}
+
+
+def as_run(algo, env_id):
+    """The entry with numbers for ``auto``, as a search begins with it."""
+    return shipped_entry(read_spec(algo, env_id, read_entry(algo, env_id)))
 
 
 # --- the files that come with the project ---------------------------------------------------------
@@ -106,10 +86,9 @@ WIDENED = {("qrdqn", "FrozenLake-v1"): ("policy_kwargs.net_arch",)}  # no hidden
 @pytest.mark.parametrize("algo", SEARCHED)
 def test_shipped_settings_are_a_trial_and_come_back(algo):
     for env_id, entry in shipped(algo).items():
-        space = read_search_space(algo, env_id).including(entry)
+        space, params = read_search_space(algo, env_id).including(entry)
         assert space.widened == WIDENED.get((algo, env_id), ())
-        params = space.params_of(entry)
-        assert params.keys() <= space.distributions().keys()
+        assert params.keys() <= space.distributions.keys()
         again = space.merged(entry, space.suggest(FixedTrial(params)))
         before, after = space.flat(entry), space.flat(again)
         for key in space.keys:
@@ -121,23 +100,21 @@ def test_shipped_settings_are_a_trial_and_come_back(algo):
 @pytest.mark.parametrize("algo", SEARCHED)
 def test_an_agent_takes_every_end_and_every_choice(algo):
     """What entries of environments change is held against the agent where they are read."""
-    algorithm, entry = load_algorithm(algo), read_hyperparams(algo, "Unknown-v0")
-    env = environment_for(algo)
-    space = read_search_space(algo, "Unknown-v0")
-    for number, settings in enumerate(corners(space)):
-        read = split(space.merged(entry, settings))
-        given = {"policy": default_policy(algorithm, is_dict=False), **read.algorithm}
-        kwargs = build_algorithm_kwargs(algorithm, given, algo)
+    algorithm, env = load_algorithm(algo), environment_for(algo)
+    entry, space = as_run(algo, env.spec.id), read_search_space(algo, env.spec.id)
+    for number, drawn in enumerate(corners(space)):
+        spec = read_spec(algo, env.spec.id, space.merged(entry, drawn))
+        kwargs = constructor_arguments(spec, algorithm, is_dict=False)
         if number < 2:
             algorithm(env=env, **{**kwargs, **one_transition(kwargs)})
     env.close()
 
 
-def suggestions_for(algo, env_id="Unknown-v0", **settings):
+def suggestions_for(algo, env_id="FrozenLake-v1", **settings):
     agents = (AgentSpec("shipped", algo, settings),)
     environments = (EnvironmentSpec(env_id, env_id),)
     tuning = TuningSpec(StudySpec("s", "S", agents, environments))
-    entry = {**shipped(algo)[env_id], **settings}
+    entry = {**as_run(algo, env_id), **settings}
     return Suggestions(tuning, read_search_space(algo, env_id), entry)
 
 
@@ -164,11 +141,8 @@ def one_transition(kwargs):
 
 
 def environment_for(algo):
-    makers = [
-        lambda i=i: gym.make(i) for i in ("FrozenLake-v1", "GaussianBandit-v0", "Pendulum-v1")
-    ]
-    for make in [*makers, Masked]:
-        env = make()
+    for env_id in ("FrozenLake-v1", "GaussianBandit-v0", "Pendulum-v1", "Warehouse-v0"):
+        env = gym.make(env_id)
         if ALGORITHMS[algo].env_misfit(env) == "":
             return env
         env.close()
@@ -206,12 +180,12 @@ def test_what_optuna_chooses_becomes_settings(space):
         "policy_kwargs": {"net_arch": [64, 64]},
         "train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.1}},
     }
-    assert close(space.params_of(settings), params)
-    assert params.keys() == space.distributions().keys()
+    assert close(space.including(settings)[1], params)
+    assert params.keys() == space.distributions.keys()
 
 
 def test_an_environments_entry_changes_the_default(tmp_path):
-    ranges = read(tmp_path, DQN_SPACE, "module:Taxi-v4").distributions()
+    ranges = read(tmp_path, DQN_SPACE, "Taxi-v4").distributions
     assert "n_steps" not in ranges
     assert ranges["exploration_fraction"].high == 0.2
     assert ranges["log2_batch_size"].high == 7
@@ -223,7 +197,7 @@ def test_what_does_not_exist_leaves_the_entry(space):
         {
             "n_timesteps": 10,
             "exploration_fraction": 0.5,
-            "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.ReLU)",
+            "policy_kwargs": {"net_arch": [8], "activation_fn": "nn.ReLU"},
         },
         settings,
     )
@@ -237,7 +211,8 @@ def test_every_setting_leads_back_to_itself(space):
     for _ in range(30):
         trial = study.ask()
         settings = space.suggest(trial)
-        params = space.params_of(settings)
+        wider, params = space.including(settings)
+        assert wider == space
         assert close(params, trial.params)
         assert space.suggest(FixedTrial(params)) == settings
 
@@ -262,12 +237,10 @@ def test_settings_outside_widen_the_space(space):
         "max_grad_norm": 5,
         "train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 7}},
     }
-    with pytest.raises(UserError, match=r"learning_rate: the search space does not hold 0\.5"):
-        space.params_of(entry)
-    with pytest.raises(UserError, match="does not hold 'falling'"):  # which is no schedule
-        space.params_of({**entry, "learning_rate": "falling"})
-    wider = space.including(entry)
-    params = wider.params_of(entry)
+    assert (
+        space.including({**entry, "learning_rate": "falling"})[1]["learning_rate_form"] == "falling"
+    )
+    wider, params = space.including(entry)
     assert params["learning_rate"] == 0.5
     assert params["one_minus_gamma"] == 0.5
     assert params["batch_size_form"] == 100
@@ -278,12 +251,11 @@ def test_settings_outside_widen_the_space(space):
     assert again == {**entry, "n_steps": 1, "policy_kwargs": {"net_arch": None}}
     widened = {*entry, "updates", "policy_kwargs.net_arch"} - {"train_freq", "gradient_steps"}
     assert set(wider.widened) == widened
-    assert wider.including(entry) == wider
+    assert wider.including(entry)[0] == wider
 
 
 def test_a_grid_goes_from_end_to_end(space):
-    grid = space.grid(3)
-    assert grid.keys() == space.distributions().keys()
+    grid = {name: spread(kind, 3) for name, kind in space.distributions.items()}
     assert grid["learning_rate"] == [0.001, 0.01, 0.1]
     assert grid["one_minus_gamma"] == pytest.approx([0.001, 0.01, 0.1])
     assert grid["log2_batch_size"] == [5, 6, 7]
@@ -294,32 +266,38 @@ def test_a_grid_goes_from_end_to_end(space):
 # --- mistakes -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("CartPole-v1: {gamma: [0.9, 1.0]}", "no entry for 'Foo-v0', and no default"),
-        ("default: {lerning_rate: {low: 0.1, high: 1.0}}", "did you mean 'learning_rate'"),
-        ("default: {gamma: {lo: 0.1, high: 1.0}}", "gamma: unknown key 'lo': did you mean 'low'"),
-        ("default: {gamma: {low: 0.9, scale: log}}", "gamma: high is missing"),
-        ("default: {gamma: {low: 0.9, high: 0.1}}", "low must be below high"),
-        ("default: {gamma: {low: 0.9, high: 1.5}}", "gamma must be between 0 and 1, not 1.5"),
-        ("default: {batch_size: {low: 30, high: 64, scale: powers_of_two}}", "powers of two"),
-        ("default: {gamma: [0, 1], u: {sets: {a: {gamma: 1}, b: {}}}}", "gamma and u both decide"),
-        (
-            "default: {env_kwargs.slip: [0.0, 0.2]}",
-            "env_kwargs.slip is what settings are judged on",
-        ),
-        ("default: {gamma: 0.9}", "gamma must be a list of values, or map low and high"),
-        ("default: {gamma: [0.9, 0.8], tau: {low: 0.1, high: 1.0, when: {gama: 0.9}}}", "'gamma'"),
-        ("default: {seed: [1, 2]}", "seed is set by --seed"),
-    ],
-)
+MISTAKES = [
+    ("CartPole-v1: {gamma: [0.9, 1.0]}", "no entry for 'FrozenLake-v1', and no default"),
+    ("default: {gamma: {lo: 0.1, high: 1.0}}", "gamma: unknown key 'lo': did you mean 'low'"),
+    ("default: {gamma: {low: 0.9, scale: log}}", "gamma: high: field required"),
+    ("default: {gamma: {low: 0.9, high: 0.1}}", "low must be below high"),
+    ("default: {batch_size: {low: 30, high: 64, scale: powers_of_two}}", "powers of two"),
+    ("default: {gamma: [0, 1], u: {sets: {a: {gamma: 1}, b: {}}}}", "gamma and u both decide"),
+    ("default: {env_kwargs.slip: [0.0, 0.2]}", "env_kwargs.slip is what settings are judged on"),
+    ("default: {gamma: 0.9}", "gamma must be a list of values, or map low and high"),
+    ("default: {gamma: [0.9]}", "there must be two values at least"),
+    ("default: {policy_kwargs.net_arch: [[64], [32]]}", "[64] needs a name, as in choices"),
+    ("default: {gamma: [0.9, 0.8], tau: {low: 0.1, high: 1.0, when: {gama: 0.9}}}", "'gamma'"),
+    # What the agent does not take.
+    ("default: {lerning_rate: {low: 0.1, high: 1.0}}", "did you mean 'learning_rate'"),
+    ("default: {gamma: {low: 0.9, high: 1.5}}", "not 1.5: input should be less than or equal to 1"),
+    ("default: {batch_size: {low: 32, high: 64.0}}", "batch_size must be a whole number"),
+    ("default: {seed: [1, 2]}", "seed is set by --seed"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), MISTAKES)
 def test_a_mistake_is_one_line_that_says_where(tmp_path, text, message):
+    place = EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1")
+    study = StudySpec("s", "S", (AgentSpec("shipped", "dqn"),), (place,))
+    path = tmp_path / "space.yml"
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(UserError) as error:
-        read(tmp_path, text)
+        open_search(TuningSpec(study, search_space=path), tmp_path)
     assert message in str(error.value)
     assert "space.yml" in str(error.value)
     assert "\n" not in str(error.value)
+    assert [*tmp_path.iterdir()] == [path]
 
 
 def test_where_there_is_nothing_to_search(tmp_path):

@@ -1,17 +1,13 @@
 """Searches over a toy: what is tried, ended early, tested again, and what a kill changes."""
 
-import errno
 import math
-import os
 import statistics
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
-import optuna
 import pandas as pd
 import pytest
-from rl_yardstick.pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
-from rl_yardstick.tuning.trial_storage import FAILURE, FIGURES, SETTINGS
+from optuna.trial import create_trial
 
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.growing import looked
@@ -24,10 +20,10 @@ from rl_yardstick.experiments.results import (
     StudyResults,
 )
 from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.settings import read_entry, seeds_tuned_on
 from rl_yardstick.tuning import retesting, searching
 from rl_yardstick.tuning.pruning import PRUNERS, is_hopeless
 from rl_yardstick.tuning.retesting import (
-    Candidate,
     Outcome,
     Retested,
     best_trials,
@@ -35,51 +31,64 @@ from rl_yardstick.tuning.retesting import (
     concluded,
     entry_text,
     is_settled,
+    label_of,
     retest_study,
     write_winner,
 )
-from rl_yardstick.tuning.searching import RunOutcome, outcome_of
-from rl_yardstick.tuning.tuning_spec import judged
+from rl_yardstick.tuning.searching import (
+    FAILURE,
+    RUNS,
+    SETTINGS,
+    RunOutcome,
+    open_storage,
+    outcome_of,
+    outcomes_of,
+)
+from rl_yardstick.tuning.tuning_spec import without_secret
 from rl_yardstick.verdicts import Estimate
 
-optuna.logging.set_verbosity(optuna.logging.ERROR)
+REAL_OUTCOME_OF, REAL_STORAGE = outcome_of, open_storage
 
 
-def test_each_trial_is_the_mean_of_its_seeds_and_the_first_has_the_shipped_settings(
-    toy, tmp_path, monkeypatch
-):
-    place = toy.opened(toy.tuning(), tmp_path)
-    launcher = toy.search(place, toy.Launcher())
-    assert len(launcher.done) == 30
-    for trial in place.queue.trials():
-        entry = trial.user_attrs[SETTINGS]
+def states(search):
+    return [trial.state.name for trial in search.trials]
+
+
+def params(search):
+    return [trial.params for trial in search.trials]
+
+
+def test_each_trial_is_the_mean_of_its_seeds_and_the_first_has_the_shipped_settings(toy):
+    search = toy.opened()
+    assert len(toy.search(search)) == 30
+    for trial in search.trials:
+        entry, runs = trial.user_attrs[SETTINGS], outcomes_of(trial)
         assert trial.value == pytest.approx(np.mean([toy.score(entry, seed) for seed in range(3)]))
-        assert set(trial.user_attrs[FIGURES]) == {"0", "1", "2"}
-    assert place.queue.trials()[0].user_attrs[SETTINGS] == toy.shipped
+        assert set(runs) == {0, 1, 2}
+    assert search.trials[0].user_attrs[SETTINGS] == toy.shipped
 
 
 @pytest.mark.parametrize(("sampler", "stops_after"), [("tpe", 29), ("gp", 14)])
-def test_what_was_broken_off_goes_on_to_the_same_trials(toy, tmp_path, sampler, stops_after):
+def test_what_was_broken_off_goes_on_to_the_same_trials(toy, sampler, stops_after):
     tuning = toy.tuning(sampler=sampler)
-    whole = toy.opened(tuning, tmp_path / "whole")
-    toy.search(whole, toy.Launcher())
-    first = toy.opened(tuning, tmp_path / "broken")
-    toy.search(first, toy.Launcher(stops_after=stops_after))
-    assert "RUNNING" not in toy.states(first)
-    again = toy.opened(tuning, tmp_path / "broken")
-    rest = toy.search(again, toy.Launcher())
-    assert toy.states(again) == ["COMPLETE"] * 10
-    assert toy.params(again) == toy.params(whole)
-    assert len(rest.done) == 30 - stops_after
+    whole = toy.opened(tuning, "whole")
+    toy.search(whole)
+    first = toy.opened(tuning, "broken")
+    toy.search(first, stops_after=stops_after)
+    assert states(first)[-1] == "RUNNING"
+    again = toy.opened(tuning, "broken")
+    assert len(toy.search(again)) == 30 - stops_after
+    assert states(again) == ["COMPLETE"] * 10
+    assert params(again) == params(whole)
 
 
-def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path):
-    place = toy.opened(toy.tuning(pruner="median", n_trials=20, n_seeds=5), tmp_path)
-    launcher = toy.search(place, toy.Launcher())
-    ended = [trial for trial in place.queue.trials() if trial.state.name == "PRUNED"]
+def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy):
+    search = toy.opened(toy.tuning(pruner="median", n_trials=20, n_seeds=5))
+    done = toy.search(search)
+    ended = [trial for trial in search.trials if trial.state.name == "PRUNED"]
     assert ended
-    assert all(len(trial.user_attrs[FIGURES]) < 5 for trial in ended)
-    assert len(launcher.done) == sum(len(t.user_attrs[FIGURES]) for t in place.queue.trials())
+    assert all(len(outcomes_of(trial)) < 5 for trial in ended)
+    assert len(done) == sum(len(outcomes_of(trial)) for trial in search.trials)
 
 
 def at_once(entry, seed):
@@ -92,107 +101,124 @@ def steps(entry, seed):
 
 
 @pytest.mark.parametrize(("retest", "n"), [(3, 10), (12, 12)])
-def test_a_saturated_search_ends_and_ranks_by_steps_to_the_threshold(toy, tmp_path, retest, n):
-    tuning = toy.tuning(n_trials=40, sampler="random", retest=retest)
-    place = toy.opened(tuning, tmp_path)
-    toy.search(place, toy.Launcher(), at_once, steps=steps)
-    ended = [trial for trial in place.queue.trials() if trial.state.is_finished()]
-    optimal = [t for t in ended if t.user_attrs[SETTINGS]["gamma"] >= 0.7]
-    assert (place.n_at_optimum, len(optimal), optimal[-1] == ended[-1]) == (n, n, True)
-    assert toy.states(place)[len(ended) :] == ["WAITING"] * (40 - len(ended))
-    ranked = best_trials(place.queue.trials(), is_cost=False)
-    rates = [each.entry["learning_rate"] for each in ranked]
+def test_a_saturated_search_ends_and_ranks_by_steps_to_the_threshold(toy, retest, n):
+    tuning, figures = toy.tuning(n_trials=40, sampler="random", retest=retest), (at_once, steps)
+    search = toy.opened(tuning)
+    toy.search(search, score=at_once, steps=steps)
+    trials = search.trials
+    optimal = [trial for trial in trials if trial.user_attrs[SETTINGS]["gamma"] >= 0.7]
+    assert (search.n_at_optimum, len(optimal), optimal[-1] == trials[-1]) == (n, n, True)
+    assert len(trials) < 40
+    ranked = best_trials(tuning, trials)
+    rates = [each.user_attrs[SETTINGS]["learning_rate"] for each in ranked]
     assert rates[:n] == sorted(rates[:n])
-    assert [each.steps for each in ranked[:n]] == pytest.approx([1000 * r + 1 for r in rates[:n]])
-    assert [each.steps for each in ranked[n:]] == [None] * (len(ended) - n)
-    assert not toy.search(toy.opened(tuning, tmp_path), toy.Launcher(), at_once, steps=steps).done
+    assert not toy.search(toy.opened(tuning), score=figures[0], steps=figures[1])
 
 
-def test_a_full_disk_says_nothing_of_settings(toy, tmp_path, monkeypatch):
-    def full(**_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    place = toy.opened(toy.tuning(), tmp_path)
-    toy.search(place, toy.Launcher(stops_after=7))
-    monkeypatch.setattr(searching.tempfile, "TemporaryFile", full)
-    with pytest.raises(UserError, match="No space left on device: make room"):
-        toy.search(place, toy.Launcher(failing={0, 1, 2}))
-    assert set(toy.states(place)) == {"COMPLETE", "WAITING"}
+def test_another_search_of_the_same_name_is_not_continued(toy):
+    toy.opened()
+    with pytest.raises(UserError, match=r"toy: the search there is another .*objective: 'mean'"):
+        toy.opened(toy.tuning(objective="lower"))
+    toy.opened(name="one", storage="shared")
+    with pytest.raises(UserError, match=r"toy: the search there is another \(folder: "):
+        toy.opened(name="two", storage="shared")
 
 
-def test_scores_are_not_compared_with_those_of_another_search_before(toy, tmp_path):
-    """The optimum of an environment may be known since an update."""
-    place = toy.opened(toy.tuning(), tmp_path)
-    toy.search(place, toy.Launcher(stops_after=7), judged_by="final")
-    with pytest.raises(UserError, match=r"judged by final, and now by score: --name NAME makes"):
-        toy.search(place, toy.Launcher())
-    assert toy.search(place, toy.Launcher(), judged_by="final").done
-    assert toy.states(place) == ["COMPLETE"] * 10
-    # Nor is another search under the same name gone on with.
-    with pytest.raises(UserError, match=r"toy: the tuning there is another .*objective: 'mean'"):
-        toy.opened(toy.tuning(objective="lower"), tmp_path)
-
-
-def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy, tmp_path):
-    place = toy.opened(toy.tuning(), tmp_path)
-
-    class Fragile(toy.Launcher):
-        def submit(self, planned):
-            self.failing = {0, 1, 2} if planned.entry["gamma"] > 0.9 else ()
-            return super().submit(planned)
-
-    toy.search(place, Fragile())
-    for trial in place.queue.trials():
+def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy):
+    search = toy.opened()
+    toy.search(search, failing=lambda run: run.entry["gamma"] > 0.9)
+    for trial in search.trials:
         fails = trial.user_attrs[SETTINGS]["gamma"] > 0.9
         assert trial.state.name == ("PRUNED" if fails else "COMPLETE")
         assert (FAILURE in trial.user_attrs) == fails
     # Where nothing but failures comes of it, it ends and says why.
-    place = toy.opened(toy.tuning(), tmp_path / "failing")
     with pytest.raises(UserError, match=r"all of the first 5 trials failed; seed \d: it broke"):
-        toy.search(place, toy.Launcher(failing={0, 1, 2}))
+        toy.search(toy.opened(name="failing"), failing=lambda run: True)
 
 
-def test_how_many_runs_there_are(toy, tmp_path):
+def test_how_many_runs_there_are(toy):
     """None after the time is over; seeds side by side; more trials beside those that are there."""
-    late = toy.opened(toy.tuning(n_trials=4), tmp_path)
-    assert not toy.search(late, toy.Launcher(), deadline=-math.inf).done
-    assert toy.states(late) == ["WAITING"] * 4
-    assert len(toy.search(late, toy.Launcher(n_workers=3)).done) == 12
-    more = toy.opened(toy.tuning(n_trials=6), tmp_path)
-    assert len(toy.search(more, toy.Launcher()).done) == 6
-    assert toy.states(more) == ["COMPLETE"] * 6
+    late = toy.opened(toy.tuning(n_trials=4))
+    assert not toy.search(late, deadline=-math.inf)
+    assert len(toy.search(late, n_workers=3)) == 12
+    more = toy.opened(toy.tuning(n_trials=6))
+    assert len(toy.search(more)) == 6
+    assert states(more) == ["COMPLETE"] * 6
 
 
-def test_what_the_user_fixes_is_not_searched(toy, tmp_path):
-    place = toy.opened(toy.tuning(settings={"gamma": 0.9}), tmp_path)
-    toy.search(place, toy.Launcher())
-    assert place.suggestions.n_free == 1
-    assert {p["gamma"] for p in toy.params(place)} == {0.9}
-    assert len({p["learning_rate"] for p in toy.params(place)}) == 10
+def test_trials_with_equal_settings_share_their_runs(toy):
+    (toy.folder / "space.yml").write_text("default: {gamma: [0.9, 0.8]}")
+    search = toy.opened(toy.tuning(sampler="random"))
+    assert len(toy.search(search, n_workers=4)) == 6
+    assert states(search) == ["COMPLETE"] * 10
+    assert len(best_trials(search.tuning, search.trials)) == 2
 
 
-def test_a_grid_goes_through_every_point_once(toy, tmp_path):
-    place = toy.opened(toy.tuning(sampler="grid", n_trials=12, figure="steps"), tmp_path / "it")
-    toy.search(place, toy.Launcher(), lambda entry, seed: 100.0 * entry["gamma"])
-    tried = {(p["learning_rate"], p["gamma"]) for p in toy.params(place)[1:]}
-    assert len(toy.params(place)) == 10  # three values of each, and what was shipped
+def test_what_the_user_fixes_is_not_searched(toy):
+    search = toy.opened(toy.tuning(settings={"gamma": 0.9}))
+    toy.search(search)
+    assert search.suggestions.n_free == 1
+    assert {p["gamma"] for p in params(search)} == {0.9}
+    assert len({p["learning_rate"] for p in params(search)}) == 10
+
+
+def test_a_grid_goes_through_every_point_once(toy):
+    search = toy.opened(toy.tuning(sampler="grid", n_trials=12, figure="steps"))
+    toy.search(search, score=lambda entry, seed: 100.0 * entry["gamma"])
+    tried = {(p["learning_rate"], p["gamma"]) for p in params(search)[1:]}
+    assert len(params(search)) == 10  # three values of each, and what was shipped
     assert len(tried) == 9
     assert {gamma for _, gamma in tried} == {0.5, 0.75, 1.0}
-    assert place.study.best_value == 50.0  # a cost is made small
+    assert search.study.best_value == 50.0  # a cost is made small
     with pytest.raises(UserError, match="4 settings with two values of each number"):
-        toy.opened(toy.tuning(sampler="grid", n_trials=4), tmp_path / "too few")
+        toy.search(toy.opened(toy.tuning(sampler="grid", n_trials=4), "too few"))
+
+
+# --- where trials are stored ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("given", [None, "sqlite:///{}/db"])
+def test_a_storage_of_any_kind_keeps_the_search(toy, monkeypatch, given):
+    monkeypatch.setattr(searching, "open_storage", REAL_STORAGE)
+    given, tuning = given and given.format(toy.folder), toy.tuning(n_trials=2, n_seeds=1)
+    search = toy.opened(tuning, "a {b} %20 c?d", given)
+    toy.search(search)
+    assert params(toy.opened(tuning, "a {b} %20 c?d", given)) == params(search)
+    if given is None:
+        (search.root / "trials.db").write_bytes(b"no database any more" * 100)
+        with pytest.raises(UserError, match=r"trials\.db: file is not a database$"):
+            toy.opened(tuning, "a {b} %20 c?d")
+
+
+def test_a_storage_that_cannot_be_opened_is_one_line_without_its_password(toy, monkeypatch):
+    monkeypatch.setattr(searching, "open_storage", REAL_STORAGE)
+    for given, said in [
+        ("nothing://u:se%40cret@127.0.0.1:1/db", r"^nothing://u:\*\*\*@127\.0\.0\.1:1/db: "),
+        ("notes.txt", r"notes\.txt: Could not parse"),
+    ]:
+        with pytest.raises(UserError, match=said) as error:
+            toy.opened(storage=given)
+        assert "cret" not in str(error.value)
+    line = "tune.py --storage postgresql://u:se%40cret@h/db -j 2"
+    assert without_secret(line) == line.replace("se%40cret", "***")
 
 
 # --- what a run and a setting are worth, worked out by hand ---------------------------------------
 
 
-def test_values_of_a_setting_by_hand():
-    values = [0.0, 1.0, 0.9, 0.8, 0.1]
-    assert judged(values, "mean", is_cost=False) == pytest.approx(0.56)
-    assert judged(values, "mean", is_cost=True) == pytest.approx(0.56)
-    assert judged(values, "iqm", is_cost=False) == pytest.approx((0.1 + 0.8 + 0.9) / 3)
-    assert judged(values, "lower", is_cost=False) == pytest.approx(0.1)
-    assert judged(values, "lower", is_cost=True) == pytest.approx(0.9)
+VALUES = [
+    ("mean", "score", 0.56),
+    ("mean", "regret", 0.56),
+    ("iqm", "score", (0.1 + 0.8 + 0.9) / 3),
+    ("lower", "score", 0.1),
+    ("lower", "regret", 0.9),
+]
+
+
+@pytest.mark.parametrize(("objective", "figure", "value"), VALUES)
+def test_values_of_a_setting_by_hand(toy, objective, figure, value):
+    tuning = toy.tuning(objective=objective, figure=figure)
+    assert tuning.value([0.0, 1.0, 0.9, 0.8, 0.1]) == pytest.approx(value)
 
 
 def outcome(toy, monkeypatch, figure, **row):
@@ -201,7 +227,7 @@ def outcome(toy, monkeypatch, figure, **row):
     row = {"seconds": 2.0, "n_timesteps": 30, "threshold": 0.5, **row}
     results = RunResults([row], [evaluations])
     monkeypatch.setattr(searching, "read_run", lambda *_: results)
-    return outcome_of(toy.tuning(figure=figure), None)
+    return REAL_OUTCOME_OF(toy.tuning(figure=figure), None)
 
 
 # The figure, what the run came to, the figure of it, and steps where it had the optimum.
@@ -254,7 +280,6 @@ WHOLE = [[0.1 * n] * 3 for n in range(1, 6)]
 # A score of 10 has been seen: with that, any trial could still win.
 NINE, TEN = ([[0.5] * n, [10.0]] for n in (9, 10))
 WORSE = [0.4, 0.39, 0.38, 0.37]
-RACE = [[0.9, 0.2, 0.8]]
 
 
 @pytest.mark.parametrize(
@@ -282,11 +307,6 @@ RACE = [[0.9, 0.2, 0.8]]
         ("halving", [0.45], FIVE, {}, False),
         ("halving", [0.35], FIVE, {}, True),
         ("halving", [0.0, 0.0, 0.0], [*WHOLE, [1.0] * 9], {}, True),
-        # A paired t test sees a steady difference at two seeds.
-        ("racing", [0.8, 0.1], RACE, {}, True),
-        ("racing", [0.8, 0.2], RACE, {}, False),
-        # t = -3 with one degree of freedom: p = 0.102, and hopeless is what is below 0.1.
-        ("racing", [0.8, 0.0], RACE, {}, False),
         # The default takes ranks from ten seeds on.
         ("auto", WORSE, NINE, {}, False),
         ("auto", WORSE, TEN, {}, True),
@@ -300,11 +320,11 @@ def test_what_is_hopeless(method, scores, others, options, hopeless):
 # === what is tested again =========================================================================
 
 
-def retested(number, held_out, verdict="undecided", in_search=0.9, n_runs=20, n_failed=0):
+def retested(number, held_out, verdict="undecided", n_failed=0):
     label = f"trial {number}" if number else "shipped"
-    interval = Estimate(held_out or 0.0, 0.5, 0.9, 20)
-    n_runs = 0 if held_out is None else n_runs
-    return Retested(label, number, in_search, held_out, interval, verdict, n_runs, n_failed)
+    return Retested(
+        label, number, 0.9, held_out, Estimate(held_out, 0.5, 0.9, 20), verdict, 20, n_failed
+    )
 
 
 @pytest.mark.parametrize(
@@ -327,20 +347,32 @@ def test_what_a_re_test_cannot_be(toy, changes, complaint):
 
 
 def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):
-    place = toy.opened(toy.tuning(), tmp_path)
-    toy.search(place, toy.Launcher())
-    ranked = best_trials(place.queue.trials(), is_cost=False)
-    assert [each.value for each in ranked] == sorted((e.value for e in ranked), reverse=True)
-    twice = best_trials([*place.queue.trials(), *place.queue.trials()], is_cost=False)
-    assert twice == ranked
-    chosen = chosen_for_retest(ranked, 3, is_cost=False)
+    search = toy.opened()
+    toy.search(search)
+    tuning = search.tuning
+    ranked = best_trials(tuning, search.trials)
+    values = [each.value for each in ranked]
+    assert values == sorted(values, reverse=True)
+    twice = best_trials(tuning, [*search.trials, *search.trials])
+    assert [each.number for each in twice] == [each.number for each in ranked]
+    chosen = chosen_for_retest(tuning, ranked)
     assert len(chosen) == 3
     assert all(each.number for each in chosen)
-    study = retest_study(place.tuning, tmp_path, chosen)
+    study = retest_study(tuning, tmp_path, chosen)
     assert list(study.seeds) == list(range(1000, 1020))
-    assert [agent.label for agent in study.agents] == ["shipped", *[e.label for e in chosen]]
+    assert [agent.label for agent in study.agents] == ["shipped", *[label_of(e) for e in chosen]]
     for agent, each in zip(study.agents[1:], chosen, strict=True):
-        assert read_hyperparams("qlearning", "FrozenLake-v1", agent.conf_file) == each.entry
+        assert (
+            read_entry("qlearning", "FrozenLake-v1", agent.conf_file) == each.user_attrs[SETTINGS]
+        )
+
+
+def complete_trial(number, entry, figures):
+    runs = {str(k): asdict(RunOutcome(figure, 1.0, "score")) for k, figure in enumerate(figures)}
+    attributes = {SETTINGS: entry, RUNS: runs}
+    trial = create_trial(value=float(np.mean(figures)), user_attrs=attributes)
+    trial.number = number
+    return trial
 
 
 @pytest.mark.parametrize(
@@ -353,19 +385,18 @@ def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):
         ((0.1,), False),
     ],
 )
-def test_settings_clearly_below_the_shipped_ones_are_not_run_again(figures, is_below):
-    def candidate(number, figures):
-        return Candidate(number, {}, float(np.mean(figures)), figures)
+def test_settings_clearly_below_the_shipped_ones_are_not_run_again(toy, figures, is_below):
+    def chosen(figure, *others):
+        found = [complete_trial(n, {}, each) for n, each in enumerate(others) if each]
+        return [each.number for each in chosen_for_retest(toy.tuning(figure=figure), found)]
 
-    shipped, other = candidate(0, (0.7, 0.8, 0.9)), candidate(1, figures)
-    assert chosen_for_retest([shipped, other], 3, is_cost=False) == [other][is_below:]
-    assert chosen_for_retest([other], 3, is_cost=False) == [other]
+    shipped, there = (0.7, 0.8, 0.9), [1][is_below:]
+    assert chosen("score", shipped, figures) == there
+    assert chosen("score", None, figures) == [1]
     # Costs are mirrored.
-    costs = [candidate(each.number, tuple(-f for f in each.figures)) for each in (shipped, other)]
-    assert chosen_for_retest(costs, 3, is_cost=True) == costs[1:][is_below:]
+    assert chosen("regret", *(tuple(-f for f in each) for each in (shipped, figures))) == there
     # Without spread, any difference counts.
-    level, lower = candidate(0, (0.8, 0.8)), candidate(1, (0.79, 0.79))
-    assert chosen_for_retest([level, lower], 3, is_cost=False) == []
+    assert chosen("score", (0.8, 0.8), (0.79, 0.79)) == []
 
 
 ENTRY = {
@@ -374,7 +405,6 @@ ENTRY = {
     "learning_rate": 3e-05,
     "policy_kwargs": {"net_arch": [64, 64], "activation_fn": "nn.ReLU"},
     "env_wrapper": [{"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.1}}],
-    "normalize": None,
 }
 
 
@@ -385,7 +415,7 @@ def runs_of_retest(toy, root, runs, **changes):
     """
     tuning = toy.tuning(retest_seeds=len(runs["shipped"]), **changes)
     labels = [label for label in runs if label != "shipped"]
-    found = [Candidate(int(label[-1]), ENTRY, 0.5, (0.5,)) for label in labels]
+    found = [complete_trial(int(label[-1]), ENTRY, [0.5]) for label in labels]
     study = retest_study(tuning, root, found)
     planned = plan(study, root)
     ended = {(r.agent, r.seed): runs[r.agent][r.seed - 1000] for r in planned}
@@ -483,20 +513,21 @@ def test_the_verdict_is_about_what_was_searched_for(
 
 def test_an_entry_is_read_as_it_was_with_the_seeds_that_it_has_seen(toy, tmp_path):
     """The search's own, and those that the settings it began with were tuned on: 0 to 9."""
-    path = tmp_path / "entry.yml"
-    path.write_text(entry_text(toy.tuning(n_seeds=12), ENTRY, ["found: somewhere"]))
-    assert read_hyperparams("qlearning", "FrozenLake-v1", path) == ENTRY
-    assert seeds_tuned_on("qlearning", "FrozenLake-v1", path) == (range(12),)
+    path, tuning = tmp_path / "found.yml", toy.tuning(n_seeds=12)
+    shipped = replace(tuning.agent, conf_file=None)
+    tuning = replace(tuning, study=replace(tuning.study, agents=(shipped,)))
+    path.write_text(entry_text(tuning, ENTRY, "found: somewhere"))
+    assert read_entry("qlearning", "FrozenLake-v1", path) == ENTRY
+    assert seeds_tuned_on("qlearning", "FrozenLake-v1", path) == (range(10), range(12))
     assert "\n# found: somewhere\nFrozenLake-v1:\n  policy: MlpPolicy\n" in path.read_text()
-    assert "    net_arch: [64, 64]\n" in path.read_text()
 
 
-def test_the_file_of_the_winner_says_where_it_comes_from(toy, tmp_path):
-    winner = retested(4, 0.85, "better", n_failed=3)
-    outcome = Outcome((retested(0, 0.7, ""), winner), winner, 0.05, "", range(1000, 1020))
-    path = write_winner(toy.tuning(), tmp_path, outcome, ENTRY, 10)
+def test_the_file_of_the_winner_says_where_it_comes_from(toy):
+    search, winner = toy.opened(), retested(4, 0.85, "better", n_failed=3)
+    outcome = Outcome((retested(0, 0.7, ""), winner), winner, "", 0.05, range(1000, 1020))
+    path = write_winner(search, outcome, ENTRY)
     said = " ".join(line[2:] for line in path.read_text().splitlines() if line.startswith("# "))
     assert "trial 4 of 10 (tpe), mean of score over the seeds 0 to 2: 0.9." in said
-    assert "On the seeds 1000 to 1019, which the search has not seen: 0.85 (95 % interval" in said
-    assert "0.5 to 0.9, 20 runs, 3 of them failed); the settings before, there: 0.7" in said
+    assert "On the seeds 1000 to 1019, which the search has not seen: 0.85 (20 runs)" in said
+    assert "the settings before, there: 0.7" in said
     assert said.endswith("Verdict on means: better.")

@@ -247,7 +247,7 @@ def write_first_pages(analysis: StudyAnalysis, n_workers: int, stop: Stop) -> li
         while wait(again, timeout=0.2).not_done:
             stop.check()
     finally:
-        pool.stop()
+        pool.stop()  # type: ignore[no-untyped-call]
         pool.join()
     for future, run in again.items():
         error = future.exception()
