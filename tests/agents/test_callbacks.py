@@ -203,7 +203,6 @@ def test_a_compiled_training_logs_once_per_block(tmp_path):
             "rollout/ep_rew_mean": np.mean(returns),
             "rollout/ep_len_mean": np.mean(lengths),
             "rollout/exploration_rate": 0.3,
-            "rollout/success_rate": np.mean(other.ep_success_buffer),
             "time/episodes": other._episode_num,
             "time/total_timesteps": other.num_timesteps,
             "train/learning_rate": 0.1,
