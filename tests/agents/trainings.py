@@ -73,6 +73,15 @@ def make(name, env, **settings):
     return algorithm(next(iter(algorithm.policy_aliases)), env, **{"seed": 1, **settings})
 
 
+def memory_of(model):
+    """Arrays on running episodes; of those with room to spare, what is in use."""
+    memory = getattr(model, "_memory", ())
+    if not hasattr(memory, "tiles"):
+        return memory
+    kept = memory.tiles, memory.actions, memory.rewards
+    return [array[i, :n] for array in kept for i, n in enumerate(memory.lengths)]
+
+
 def state_of(model):
     """Everything that what comes next depends on, and everything that statistics are made of."""
     counts = model.num_timesteps, model._total_timesteps, model._episode_num, model._n_updates
@@ -84,7 +93,7 @@ def state_of(model):
         "observations": np.asarray(model._last_obs).tolist(),
         "episode starts": model._last_episode_starts.tolist(),
         "pending actions": np.asarray(getattr(model, "_next_actions", ())).tolist(),
-        "memory": [array.tobytes() for array in getattr(model, "_memory", ())],
+        "memory": [array.tobytes() for array in memory_of(model)],
         "counts": (*counts, model._current_progress_remaining),
         "error": getattr(model, "mean_td_error", None),
         "returns": [(info["r"], info["l"]) for info in model.ep_info_buffer],
