@@ -243,10 +243,8 @@ def check_settings_kept(job: Job, planned: Sequence[PlannedRun], replaces: bool)
     if not others:
         return
     if not replaces:
-        found = {key: pair for _, settings in others for key, pair in settings.items()}
-        named = [
-            f"{key}: {shown(was)} there, {shown(now)} now" for key, (was, now) in found.items()
-        ]
+        pairs = {key: pair for _, settings in others for key, pair in settings.items()}
+        named = [f"{key}: {shown(a)} there, {shown(b)} now" for key, (a, b) in pairs.items()]
         words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
         runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
         raise UserError(
