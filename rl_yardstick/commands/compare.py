@@ -191,7 +191,9 @@ def held(root: Path) -> Iterator[None]:
         finally:
             if [path.name for path in root.iterdir()] == [LOCK]:
                 (root / LOCK).unlink()
-                root.rmdir()
+                with suppress(OSError):  # of folders above that are not empty
+                    for folder in (root, *list(root.parents)[:2]):
+                        folder.rmdir()
 
 
 def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> Workers:
