@@ -3,6 +3,7 @@
 import re
 
 import pytest
+from optuna.trial import create_trial
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.commands import compare, enjoy, train, tune
@@ -15,7 +16,7 @@ from rl_yardstick.experiments.study import StudySpec
 from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.spec import TrainSpec
-from rl_yardstick.tuning.retesting import Candidate, retest_study
+from rl_yardstick.tuning.retesting import retest_study
 from rl_yardstick.tuning.suggesting import planned_runs
 
 TRAIN, ENJOY, COMPARE = train, enjoy, compare
@@ -180,11 +181,11 @@ def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(tmp_path):
         entry = {"n_timesteps": 10, **tuning.agent.settings}
         run, *_ = planned_runs(tuning, tmp_path, entry)
         assert run.spec.algorithm.get("engine") == search
-        study = retest_study(tuning, tmp_path, [Candidate(1, entry, 0.5)])
+        trial = create_trial(value=0.5, user_attrs={"settings": entry})
+        study = retest_study(tuning, tmp_path, [trial])
         engines = {r.spec.algorithm.get("engine") for r in plan(study, tmp_path)}
         assert engines == {retest}
-        # Another engine makes another search; where there is none to choose, an old one goes on.
-        assert tuning.identity(entry, {}).get("search_engine") == (None if retest else search)
+        assert tuning.identity(entry, {})["search_engine"] == search  # another makes another search
 
 
 # --- a flag that there is not is answered with what was meant -----------------------------------
