@@ -88,22 +88,22 @@ def draw_estimates() -> None:
         log_uniformly(env, 5_000, 1, Path(folder) / "log.csv")
         data = read_log(Path(folder) / "log.csv")
     contexts = data.observations(data.observation_space)
-    model = cross_fit(contexts, data.arms, data.rewards, 3)
+    predicted = cross_fit(contexts, data.arms, data.rewards, 3)
     tables = {f"always treatment {arm}": np.eye(3)[[arm, arm]] for arm in range(3)}
     tables["best for each segment"] = np.eye(3)[RATES.argmax(axis=1)]
     figure, axis = plt.subplots(figsize=(7.5, 3.6), layout="constrained")
-    names = {"ips": "IPS", "snips": "self-normalised", "direct": "direct"}
-    names["doubly_robust"] = "doubly robust"
+    names = {"ips": "IPS", "snips": "self-normalised", "doubly_robust": "doubly robust"}
     assert data.propensities is not None
     for row, table in enumerate(tables.values()):
         truth = float(SHARES @ (table * RATES).sum(axis=1))
         axis.plot([truth, truth], [row - 0.35, row + 0.35], color="0.3", linewidth=1.2)
-        terms = evaluate_policy(table[contexts], data.arms, data.rewards, data.propensities, model)
+        pulls = data.arms, data.rewards, data.propensities
+        terms = evaluate_policy(table[contexts], *pulls, predicted)
         for place, (name, label) in enumerate(names.items()):
             estimate = mean_reward(getattr(terms, name))
             axis.errorbar(
                 estimate.point,
-                row + 0.15 * (place - 1.5),
+                row + 0.2 * (place - 1),
                 xerr=estimate.point - estimate.low,
                 fmt="o",
                 markersize=4,

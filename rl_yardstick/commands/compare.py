@@ -191,7 +191,9 @@ def held(root: Path) -> Iterator[None]:
         finally:
             if [path.name for path in root.iterdir()] == [LOCK]:
                 (root / LOCK).unlink()
-                root.rmdir()
+                with suppress(OSError):  # of folders above that are not empty
+                    for folder in (root, *list(root.parents)[:2]):
+                        folder.rmdir()
 
 
 def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> Workers:
@@ -243,10 +245,8 @@ def check_settings_kept(job: Job, planned: Sequence[PlannedRun], replaces: bool)
     if not others:
         return
     if not replaces:
-        found = {key: pair for _, settings in others for key, pair in settings.items()}
-        named = [
-            f"{key}: {shown(was)} there, {shown(now)} now" for key, (was, now) in found.items()
-        ]
+        pairs = {key: pair for _, settings in others for key, pair in settings.items()}
+        named = [f"{key}: {shown(a)} there, {shown(b)} now" for key, (a, b) in pairs.items()]
         words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
         runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
         raise UserError(

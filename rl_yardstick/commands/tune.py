@@ -8,14 +8,12 @@ import math
 import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rl_yardstick.commands.cli import (
     COUNT,
@@ -61,7 +59,6 @@ if TYPE_CHECKING:
 
 SEEDS: Mapping[str, Any] = {"type": whole_number(1, 1000), "metavar": "N"}
 FIRST_SEED: Mapping[str, Any] = {"type": whole_number(0, 2**31), "metavar": "N"}
-SECONDS_BETWEEN_LINES = 10.0
 
 EPILOG = """\
 examples:
@@ -219,9 +216,10 @@ def main() -> int:
         from rl_yardstick.tuning.searching import open_search, storage_errors
     with held(root), workers, storage_errors(without_secret(args.storage or f"{root}/trials.db")):
         search = open_search(tuning, root, args.storage)
+        search.deadline = deadline
         print_opened(job, search)
         try:
-            do_trials(job, search, deadline)
+            do_trials(job, search)
             print_search(job.console, search)
             return do_retest(job, search)
         except Stopped:
@@ -229,52 +227,53 @@ def main() -> int:
             raise
 
 
-def do_trials(job: Job, search: Search, deadline: float) -> None:
-    """Do trials until there are enough; begin no run after ``deadline`` (`time.monotonic`)."""
-    from rl_yardstick.experiments.pool import keep_busy
+def do_trials(job: Job, search: Search) -> None:
+    """Do trials until there are enough; tell those that fail, and the best so far."""
+    from rl_yardstick.experiments.pool import keep_busy, progress
 
-    search.deadline = deadline
-    if not search.is_done:
-        with progress(job.console, search) as search.tell:
-            keep_busy(job.workers, search.next_run, search.ended, job.command, job.stop)
+    sign = 1 if search.tuning.is_cost else -1
+    ended = [trial for trial in search.trials if trial.state.is_finished()]
+    whole = [t.value for t in ended if t.state.name == "COMPLETE" and t.value is not None]
+    best = min((sign * value for value in whole), default=math.inf)
+    n_failed = 0
+    with progress(job.console, search.n_trials - len(ended), "trials") as advance:
+
+        def tell(number: int, value: float | None, failure: str) -> None:
+            nonlocal best, n_failed
+            if failure:
+                n_failed += 1
+                say(job.console, f"trial {number} failed: {failure}")
+            elif value is not None and sign * value < best:
+                best = sign * value
+                say(job.console, f"trial {number}: {value:.4g}, the best so far")
+            advance(n_failed)
+
+        search.tell = tell
+        keep_busy(job.workers, search.next_run, search.ended, job.command, job.stop)
 
 
 def do_retest(job: Job, search: Search) -> int:
     """Run the best settings again, and write the winner; return the exit code."""
-    from rl_yardstick.tuning.retesting import WINNER, best_trials, chosen_for_retest, write_winner
+    from rl_yardstick.tuning.retesting import best_trials, chosen_for_retest, write_winner
 
-    tuning, console = search.tuning, job.console
-    ranked = best_trials(tuning, search.trials)
-    chosen = chosen_for_retest(tuning, ranked)
-    if not chosen:
-        if tuning.retest:
-            which = "no settings but the shipped ones" if ranked else "no settings"
-            why = f"{which} were judged to the end"
-            if any(each.number for each in ranked):
-                why = "the best settings are clearly below the shipped settings in the search"
-            say(console, f"{why}: no re-test")
-        write_down(job, search, None)
-        return 0 if ranked or not search.is_done else 1
-    code, outcome = retested(job, search, ranked, chosen)
-    print_outcome(console, outcome)
-    winner = outcome.winner
-    if winner is None:
-        (search.root / WINNER).unlink(missing_ok=True)  # from before the search continued
+    ranked = best_trials(search.tuning, search.trials)
+    chosen = chosen_for_retest(search.tuning, ranked)
+    if chosen:
+        code, outcome = retested(job, search, ranked, chosen)
+        print_outcome(job.console, outcome)
+        path = write_winner(search, outcome)
         write_down(job, search, outcome)
+        if path is not None and outcome.winner is not None:
+            print_winner(job.console, search, outcome.winner.number, path)
         return code
-    entry = search.trials[winner.number].user_attrs["settings"]
-    path = write_winner(search, outcome, entry)
-    write_down(job, search, outcome)
-    words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id, "--conf-file"]
-    how = f"{called_as('train')} {shlex.join([*words, str(path)])}"
-    say(console, f"winner: {winner.label}, in {path}: {how}")
-    say(console, f"  {winner.verdict} than the shipped settings, on average")
-    shipped = search.suggestions.shipped
-    for key in {**shipped, **entry}:
-        if entry.get(key) != shipped.get(key):
-            before, now = (each.get(key, "left out") for each in (shipped, entry))
-            say(console, f"  {key}: {now} (was {before})")
-    return code
+    if search.tuning.retest:
+        which = "no settings but the shipped ones" if ranked else "no settings"
+        why = f"{which} were judged to the end"
+        if any(each.number for each in ranked):
+            why = "the best settings are clearly below the shipped settings in the search"
+        say(job.console, f"{why}: no re-test")
+    write_down(job, search, None)
+    return 0 if ranked or not search.is_done else 1
 
 
 def retested(
@@ -335,18 +334,13 @@ def print_opened(job: Job, search: Search) -> None:
     if mark := unproven_mark(tuning):
         lines.append(f"scores are{mark}")
     if suggestions.fits_batches:
-        lines.append(
-            "batch_size: where it does not divide n_steps times n_envs, as the library recommends, "
-            "the nearest number that does is tried"
-        )
+        lines.append("batch_size: the nearest number that divides n_steps times n_envs is tried")
     wider = "the search space is widened to hold the shipped value"
     lines += [f"{name}: {wider}" for name in suggestions.space.widened]
     if algo in NETWORKS:
-        runs = (
-            planned_runs(tuning, job.root, suggestions.shipped)[0],
-            shipped_run(tuning, job.root),
-        )
-        if line := search_line(algo, *(planned_outlook(run.spec) for run in runs)):
+        searched = planned_runs(tuning, job.root, suggestions.shipped)[0].spec
+        specs = searched, shipped_run(tuning, job.root).spec
+        if line := search_line(algo, *map(planned_outlook, specs)):
             lines.append(f"engine: {line}")
     for line in lines:
         say(job.console, line)
@@ -401,38 +395,14 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
         say(console, f"no winner: {outcome.reason}; they stay as they are")
 
 
-@contextmanager
-def progress(
-    console: Console, search: Search
-) -> Iterator[Callable[[int, float | None, str], None]]:
-    """A bar on a terminal, and else a line now and then; failures and the best trials anyway.
-
-    Yields what is to be called with the number of a trial that has ended, its value, and the reason
-    of a failure.
-    """
-    sign = 1 if search.tuning.is_cost else -1
-    ended = [trial for trial in search.trials if trial.state.is_finished()]
-    whole = [trial for trial in ended if trial.state.name == "COMPLETE"]
-    best = min((sign * trial.value for trial in whole if trial.value is not None), default=math.inf)
-    n_ended, told_at, is_live = len(ended), time.monotonic(), console.is_terminal
-    columns = TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    words = TextColumn("{task.description}")
-    with Progress(*columns, words, console=console, transient=True, disable=not is_live) as bar:
-        task = bar.add_task("", total=search.n_trials, completed=n_ended)
-
-        def tell(number: int, value: float | None, reason: str) -> None:
-            nonlocal best, n_ended, told_at
-            n_ended += 1
-            if reason:
-                say(console, f"trial {number} failed: {reason}")
-            elif value is not None and sign * value < best:
-                best = sign * value
-                say(console, f"trial {number}: {value:.4g}, the best so far")
-            text = f"best {sign * best:.4g}" if best < math.inf else ""
-            bar.update(task, completed=n_ended, description=text)
-            if not is_live and time.monotonic() - told_at > SECONDS_BETWEEN_LINES:
-                told_at = time.monotonic()
-                done = f"{n_ended} of {search.n_trials} trials"
-                say(console, f"{done}; {text}" if text else done)
-
-        yield tell
+def print_winner(console: Console, search: Search, number: int, path: Path) -> None:
+    """Print how to train with the winner, and which of its settings differ from the shipped."""
+    tuning = search.tuning
+    words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id, "--conf-file"]
+    how = f"{called_as('train')} {shlex.join([*words, str(path)])}"
+    say(console, f"winner: trial {number}, in {path}: {how}")
+    shipped, entry = search.suggestions.shipped, search.trials[number].user_attrs["settings"]
+    for key in {**shipped, **entry}:
+        before, now = (each.get(key, "left out") for each in (shipped, entry))
+        if now != before:
+            say(console, f"  {key}: {now} (was {before})")

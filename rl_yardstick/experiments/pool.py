@@ -206,7 +206,7 @@ def do_runs(
     """
     failures: dict[Path, str] = {}
     to_do = list(runs)[::-1]
-    with _progress(console, len(runs)) as advance:
+    with progress(console, len(runs)) as advance:
 
         def ended(run: PlannedRun, reason: str) -> None:
             if reason:
@@ -275,10 +275,13 @@ def _in_words(error: BaseException, run: PlannedRun, timeout: float | None) -> s
 
 
 @contextmanager
-def _progress(console: Console, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar on a terminal, and else a line now and then and at the end."""
+def progress(console: Console, total: int, what: str = "runs") -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal, and else a line now and then and at the end.
+
+    Yields what is to be called after each piece of work, with the number of those that have failed.
+    """
     begun = told_at = time.monotonic()
-    columns = TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     failed = TextColumn("{task.description}")
     is_live = console.is_terminal and total > 0
     with Progress(*columns, failed, console=console, transient=True, disable=not is_live) as bar:
@@ -292,7 +295,7 @@ def _progress(console: Console, total: int) -> Iterator[Callable[[int], None]]:
             now = time.monotonic()
             if not is_live and (n_done == total or now - told_at > SECONDS_BETWEEN_LINES):
                 told_at = now
-                text = f"{n_done} of {total} runs in {now - begun:.0f} s{words}"
+                text = f"{n_done} of {total} {what} in {now - begun:.0f} s{words}"
                 console.print(text, highlight=False)
 
         yield advance

@@ -54,6 +54,7 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> Env:
             raise unknown(f"{env_id}: unknown argument", foreign, known) from error
         # Gymnasium adds all arguments to some errors.
         what = one_line(error).partition(" was raised from the environment creator")[0]
+        what = f"there is no {what}" if isinstance(error, KeyError) else what
         if kwargs and not any(name in what for name in kwargs):
             what += f" (with {', '.join(f'{name}={shown(kwargs[name])}' for name in kwargs)})"
         raise UserError(f"{env_id}: {what}") from error

@@ -29,7 +29,10 @@ class ProgressCallback(BlockCallback):
     def __init__(self, console: Console, n_timesteps: int, on_variant: bool = False) -> None:
         super().__init__()
         self.console, self.on_variant = console, on_variant
+        # A block of compiled training ends where a callback acts: nobody reads a quiet console.
         self.every_n_steps = min(max(n_timesteps // UPDATES, 1), 20_000)
+        if console.quiet:
+            self.every_n_steps = max(n_timesteps, 1)
         self.bar: Progress | None = None
         self.task: Any = None
         self.told_at = time.monotonic()

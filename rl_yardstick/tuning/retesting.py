@@ -258,17 +258,23 @@ def _yaml(data: Mapping[str, Any]) -> str:
     return yaml.safe_dump(plain(data), sort_keys=False, allow_unicode=True)
 
 
-def write_winner(search: Search, outcome: Outcome, entry: Mapping[str, Any]) -> Path:
-    """Write the winner's entry for `hyperparams/` and ``--conf-file``; returns the file."""
+def write_winner(search: Search, outcome: Outcome) -> Path | None:
+    """Write the winner's entry for `hyperparams/` and ``--conf-file``; returns the file, if any."""
     path = search.root / WINNER
-    write_text(path, entry_text(search.tuning, entry, _provenance(search, outcome, entry)))
+    if outcome.winner is None:
+        path.unlink(missing_ok=True)  # from before the search continued
+        return None
+    entry = search.trials[outcome.winner.number].user_attrs[SETTINGS]
+    comment = _provenance(search, outcome, outcome.winner, entry)
+    write_text(path, entry_text(search.tuning, entry, comment))
     return path
 
 
-def _provenance(search: Search, outcome: Outcome, entry: Mapping[str, Any]) -> str:
+def _provenance(
+    search: Search, outcome: Outcome, winner: Retested, entry: Mapping[str, Any]
+) -> str:
     """The origin of the winner's settings, in a few sentences."""
-    tuning, winner, shipped = search.tuning, outcome.winner, outcome.retested[0]
-    assert winner is not None
+    tuning, shipped = search.tuning, outcome.retested[0]
     seeds, held_out = tuning.study.seeds, outcome.held_out
     n_others = len(outcome.retested) - 1
     chosen = f", the best of {n_others} that were run again" if n_others > 1 else ""

@@ -60,7 +60,7 @@ class SearchSpace:
         return {name: kind for each in every for name, kind in each.distributions.items()}
 
     def suggest(self, trial: Trial | FixedTrial) -> dict[str, Any]:
-        """Sample settings in the form of hyperparameter files; `merged` puts them into an entry.
+        """Sample settings, nested ones by dotted names; `merged` puts them into an entry.
 
         Samples a conditional parameter only if its conditions hold.
         """
@@ -78,12 +78,7 @@ class SearchSpace:
         for each in self.entries.values():
             if _is_there(each, words):
                 chosen.update(each.settings(noting))
-        nested: dict[str, Any] = {}
-        for key, value in chosen.items():
-            outer, _, inner = key.partition(".")
-            if value is not LEFT_OUT:
-                (nested.setdefault(outer, {}) if inner else nested)[inner or outer] = value
-        return nested
+        return {key: value for key, value in chosen.items() if value is not LEFT_OUT}
 
     def including(self, settings: Mapping[str, Any]) -> tuple[SearchSpace, dict[str, Any]]:
         """The space, widened if necessary to include these settings; missing ones have defaults.
@@ -108,22 +103,16 @@ class SearchSpace:
         Removes settings of the space that are not in ``settings``, because their conditions do not
         hold.
         """
-        kept = {
-            k: dict(value) if isinstance(value, dict) else value for k, value in shipped.items()
-        }
+        kept = {key: value for key, value in shipped.items() if key not in self.keys}
+        entry = override(kept, {key: value for key, value in settings.items() if "." not in key})
         for key in self.keys:
-            outer, _, inner = key.partition(".")
-            if not inner:
-                kept.pop(outer, None)
-            elif isinstance(kept.get(outer), dict):
-                kept[outer].pop(inner, None)
-        changes = {
-            key: {**kept[key], **value}
-            if isinstance(value, dict) and isinstance(kept.get(key), dict)
-            else value
-            for key, value in settings.items()
-        }
-        return {key: value for key, value in override(kept, changes).items() if value != {}}
+            outer, dot, inner = key.partition(".")
+            if dot:
+                given = entry.get(outer)
+                others = dict(given) if isinstance(given, dict) else {}
+                others.pop(inner, None)
+                entry[outer] = others | ({inner: settings[key]} if key in settings else {})
+        return {key: value for key, value in entry.items() if value != {}}
 
     def flat(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """The values of an entry for the space's keys; missing settings have their defaults."""
@@ -195,8 +184,7 @@ def read_search_space(algo: str, env_id: str, path: Path | str | None = None) ->
     entries = {name: _dimension(name, value, f"{where}: {name}") for name, value in said.items()}
     if not entries:
         raise UserError(f"{where}: there is nothing to search for {algo}")
-    _check_names(entries, where)
-    _check_conditions(entries, where)
+    _check(entries, where)
     return SearchSpace(entries, _defaults(algo))
 
 
@@ -255,35 +243,27 @@ def _dimension(name: str, said: Any, place: str) -> Dimension:
         raise UserError(f"{place}: {key}{reason[:1].lower()}{reason[1:]}") from None
 
 
-def _check_names(entries: Mapping[str, Dimension], where: str) -> None:
-    """Check that no setting has two dimensions, and that none changes the task."""
+def _check(entries: Mapping[str, Dimension], where: str) -> None:
+    """Check that no setting has two dimensions or changes the task, and the words of conditions."""
     deciders: dict[str, str] = {}
+    before: dict[str, Dimension] = {}
     for name, each in entries.items():
-        task = next((key for key in each.keys if key.partition(".")[0] in _TASK), None)
-        if task is not None:
+        if task := [key for key in each.keys if key.partition(".")[0] in _TASK]:
             raise UserError(
-                f"{where}: {task} is what settings are judged on, and not searched: give it by "
+                f"{where}: {task[0]} is what settings are judged on, and not searched: give it by "
                 "--env-kwargs, or search train_env_kwargs"
             )
         decided = () if each.when else each.keys  # conditional ones may exclude each other
         for key in (*decided, *each.distributions):
-            other = deciders.setdefault(key, name)
-            if other != name:
+            if (other := deciders.setdefault(key, name)) != name:
                 raise UserError(f"{where}: {other} and {name} both decide {key}: leave one out")
-
-
-def _check_conditions(entries: Mapping[str, Dimension], where: str) -> None:
-    """Check that conditions name earlier choices, and existing words of these."""
-    before: dict[str, Dimension] = {}
-    for name, each in entries.items():
         for other, words in each.when.items():
             place = f"{where}: {name}: when"
             if other not in before:
                 raise unknown(f"{place}: no choice above it is called", other, before)
             options = before[other].options
-            strange = next((word for word in words if word not in options), None)
-            if strange is not None:
-                raise unknown(f"{place}: {other} has no value", str(strange), map(str, options))
+            if strange := [str(word) for word in words if word not in options]:
+                raise unknown(f"{place}: {other} has no value", strange[0], map(str, options))
         if each.range is None:
             before[name] = each
 

@@ -17,7 +17,7 @@ from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.tuning.retesting import retest_study
-from rl_yardstick.tuning.suggesting import SETTINGS, planned_runs
+from rl_yardstick.tuning.suggesting import planned_runs
 
 TRAIN, ENJOY, COMPARE = train, enjoy, compare
 LAKE = ["--env", "FrozenLake-v1"]
@@ -181,12 +181,11 @@ def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(tmp_path):
         entry = {"n_timesteps": 10, **tuning.agent.settings}
         run, *_ = planned_runs(tuning, tmp_path, entry)
         assert run.spec.algorithm.get("engine") == search
-        trial = create_trial(value=0.5, user_attrs={SETTINGS: entry})
+        trial = create_trial(value=0.5, user_attrs={"settings": entry})
         study = retest_study(tuning, tmp_path, [trial])
         engines = {r.spec.algorithm.get("engine") for r in plan(study, tmp_path)}
         assert engines == {retest}
-        # Another engine makes another search; where there is none to choose, an old one goes on.
-        assert tuning.identity(entry, {}).get("search_engine") == (None if retest else search)
+        assert tuning.identity(entry, {})["search_engine"] == search  # another makes another search
 
 
 # --- a flag that there is not is answered with what was meant -----------------------------------

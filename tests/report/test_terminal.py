@@ -11,7 +11,6 @@ import pytest
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.experiments.off_policy import Comparison, Judged, PolicyTerms
 from rl_yardstick.report.terminal import (
-    folded,
     print_analysis,
     print_comparison,
     print_episodes_table,
@@ -84,18 +83,3 @@ def test_no_digit_is_cut_and_no_column_missed_at_any_width(table):
                 assert rows
                 assert max(map(len, rows)) <= width
             assert "…" not in shown
-
-
-@pytest.mark.parametrize(
-    ("name", "width", "lines"),
-    [
-        ("logs/linucb/ReplayBandit-v0_2", 28, ["logs/linucb/", "ReplayBandit-v0_2"]),
-        ("always arm 0", 12, ["always arm 0"]),
-        ("sarsa with α = 0.0078125", 20, ["sarsa with α =", "0.0078125"]),
-        ("learning_rate=0.0625_gamma=1", 20, ["learning_rate=", "0.0625_gamma=1"]),
-        ("x" * 25, 12, ["x" * 12, "x" * 12, "x"]),
-        ("", 12, [""]),
-    ],
-)
-def test_names_end_their_lines_where_words_end(name, width, lines):
-    assert folded(name, width).split("\n") == lines

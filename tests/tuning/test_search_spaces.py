@@ -177,9 +177,11 @@ def test_what_optuna_chooses_becomes_settings(space):
         "gradient_steps": 8,
         "max_grad_norm": 10,
         "exploration_fraction": 0.25,
-        "policy_kwargs": {"net_arch": [64, 64]},
+        "policy_kwargs.net_arch": [64, 64],
         "train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.1}},
     }
+    settings = space.merged({}, settings)
+    assert settings["policy_kwargs"] == {"net_arch": [64, 64]}
     assert close(space.including(settings)[1], params)
     assert params.keys() == space.distributions.keys()
 
@@ -192,7 +194,7 @@ def test_an_environments_entry_changes_the_default(tmp_path):
 
 
 def test_what_does_not_exist_leaves_the_entry(space):
-    settings = {"max_grad_norm": 1, "policy_kwargs": {"net_arch": [32]}}
+    settings = {"max_grad_norm": 1, "policy_kwargs.net_arch": [32]}
     merged = space.merged(
         {
             "n_timesteps": 10,
@@ -211,7 +213,7 @@ def test_every_setting_leads_back_to_itself(space):
     for _ in range(30):
         trial = study.ask()
         settings = space.suggest(trial)
-        wider, params = space.including(settings)
+        wider, params = space.including(space.merged({}, settings))
         assert wider == space
         assert close(params, trial.params)
         assert space.suggest(FixedTrial(params)) == settings

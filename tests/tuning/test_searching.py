@@ -320,11 +320,9 @@ def test_what_is_hopeless(method, scores, others, options, hopeless):
 # === what is tested again =========================================================================
 
 
-def retested(number, held_out, verdict="undecided", n_failed=0):
+def retested(number, held_out, verdict):
     label = f"trial {number}" if number else "shipped"
-    return Retested(
-        label, number, 0.9, held_out, Estimate(held_out, 0.5, 0.9, 20), verdict, 20, n_failed
-    )
+    return Retested(label, number, 0.9, held_out, Estimate(held_out, 0.5, 0.9, 20), verdict, 20, 0)
 
 
 @pytest.mark.parametrize(
@@ -523,11 +521,15 @@ def test_an_entry_is_read_as_it_was_with_the_seeds_that_it_has_seen(toy, tmp_pat
 
 
 def test_the_file_of_the_winner_says_where_it_comes_from(toy):
-    search, winner = toy.opened(), retested(4, 0.85, "better", n_failed=3)
+    search, winner = toy.opened(), retested(4, 0.85, "better")
+    toy.search(search)
     outcome = Outcome((retested(0, 0.7, ""), winner), winner, "", 0.05, range(1000, 1020))
-    path = write_winner(search, outcome, ENTRY)
+    path = write_winner(search, outcome)
+    assert read_entry("qlearning", "FrozenLake-v1", path) == search.trials[4].user_attrs[SETTINGS]
     said = " ".join(line[2:] for line in path.read_text().splitlines() if line.startswith("# "))
     assert "trial 4 of 10 (tpe), mean of score over the seeds 0 to 2: 0.9." in said
     assert "On the seeds 1000 to 1019, which the search has not seen: 0.85 (20 runs)" in said
     assert "the settings before, there: 0.7" in said
     assert said.endswith("Verdict on means: better.")
+    assert write_winner(search, replace(outcome, winner=None)) is None
+    assert not path.exists()

@@ -111,19 +111,20 @@ def page_frame(
     scripts: Sequence[str], styles: Sequence[str] = STYLES, is_plotted: bool = True
 ) -> dict[str, str]:
     """Styles, scripts, and their content security policy; of a page with figures also Plotly."""
-    from plotly.offline import get_plotlyjs
-
     early, own = template_file("theme.js"), "\n".join(map(template_file, scripts))
-    running = [early, own, *([template_file("start.js"), get_plotlyjs()] if is_plotted else [])]
-    return {
-        "style": Markup("\n".join(map(template_file, styles))),  # noqa: S704  # our own
-        "policy": " ".join(map(script_hash, running)),
+    style = Markup("\n".join(map(template_file, styles)))  # noqa: S704  # our own
+    page: dict[str, str] = {
+        "style": style,
         "early": inline_script(early),
         "own": inline_script(own),
-        **(
-            {"start": inline_script(running[2]), "plotly": packed(running[3])} if is_plotted else {}
-        ),
     }
+    running = [early, own]
+    if is_plotted:
+        from plotly.offline import get_plotlyjs
+
+        running += [template_file("start.js"), get_plotlyjs()]
+        page |= {"start": inline_script(running[2]), "plotly": packed(running[3])}
+    return {**page, "policy": " ".join(map(script_hash, running))}
 
 
 def setting(value: Any) -> str:
