@@ -96,7 +96,7 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(type_command,
     assert "4 runs, 2 of them there already" in type_command(*PAIR, "--seeds", 2)[1]
     assert first.items() <= records(study).items()
     assert sorted(rows(study)["seed"]) == [0, 0, 1, 1]
-    words = "--algo sarsa --env FrozenLake-v1 --seed 0 --n-episodes 60 --verbose 0".split()
+    words = ["--algo", "sarsa", "--env", "FrozenLake-v1", "--seed", 0, "--n-episodes", 60]
     assert type_command(*words, program="train.py")[0] == 0
     places = (folder / "logs", study / "runs")
     paths = (place / "sarsa" / "FrozenLake-v1_1" / "0.monitor.csv" for place in places)
