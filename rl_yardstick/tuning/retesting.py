@@ -156,8 +156,7 @@ class Retested:
 class Outcome:
     """The result of a search."""
 
-    # The shipped settings, then the others, best in the search first.
-    retested: tuple[Retested, ...]
+    retested: tuple[Retested, ...]  # the shipped settings, then the others, best first
     # The best of the others with runs on all held-out seeds and a verdict that it is better than
     # the shipped settings.
     winner: Retested | None
@@ -259,36 +258,30 @@ def _yaml(data: Mapping[str, Any]) -> str:
 
 
 def write_winner(search: Search, outcome: Outcome) -> Path | None:
-    """Write the winner's entry for `hyperparams/` and ``--conf-file``; returns the file, if any."""
-    path = search.root / WINNER
-    if outcome.winner is None:
+    """Write the winner's entry for `hyperparams/` and ``--conf-file``; returns the file, if any.
+
+    A comment in it has the origin of the settings.
+    """
+    path, tuning, winner = search.root / WINNER, search.tuning, outcome.winner
+    if winner is None:
         path.unlink(missing_ok=True)  # from before the search continued
         return None
-    entry = search.trials[outcome.winner.number].user_attrs[SETTINGS]
-    comment = _provenance(search, outcome, outcome.winner, entry)
-    write_text(path, entry_text(search.tuning, entry, comment))
-    return path
-
-
-def _provenance(
-    search: Search, outcome: Outcome, winner: Retested, entry: Mapping[str, Any]
-) -> str:
-    """The origin of the winner's settings, in a few sentences."""
-    tuning, shipped = search.tuning, outcome.retested[0]
+    entry = search.trials[winner.number].user_attrs[SETTINGS]
     seeds, held_out = tuning.study.seeds, outcome.held_out
     n_others = len(outcome.retested) - 1
     chosen = f", the best of {n_others} that were run again" if n_others > 1 else ""
-    text = (
+    comment = (
         f"Tuned by tune.py on {time.strftime('%Y-%m-%d')}: trial {winner.number} of "
         f"{search.n_trials} ({tuning.sampler}), {tuning.objective} of {tuning.figure}"
         f"{unproven_mark(tuning)} over the seeds {seeds.start} to {seeds.stop - 1}: "
         f"{winner.in_search:.4g}. On the seeds {held_out.start} to {held_out.stop - 1}, which the "
         f"search has not seen{chosen}: {winner.held_out:.4g} ({winner.n_runs} runs); the settings "
-        f"before, there: {shipped.held_out:.4g}. Verdict on means: {winner.verdict}."
+        f"before, there: {outcome.retested[0].held_out:.4g}. Verdict on means: {winner.verdict}."
     )
     if tuning.searched(entry) != dict(entry):
-        text += " The search ran with engine: auto, the re-test in the engine of train.py."
-    return text
+        comment += " The search ran with engine: auto, the re-test in the engine of train.py."
+    write_text(path, entry_text(tuning, entry, comment))
+    return path
 
 
 def unproven_mark(tuning: TuningSpec) -> str:

@@ -324,13 +324,10 @@ def open_search(tuning: TuningSpec, root: Path, url: str | None = None) -> Searc
         asked["folder"] = str(root.absolute())
     before = study.user_attrs.get(ASKED, asked)
     if changed := [key for key in asked if before.get(key) != asked[key]]:
-        was = "; ".join(
-            f"{key}: {shown(before.get(key))} there, {shown(asked[key])} now" for key in changed[:3]
-        )
-        raise UserError(
-            f"{tuning.study.name}: the search there is another ({was}): --name NAME makes one of "
-            "its own"
-        )
+        pairs = [(key, shown(before.get(key)), shown(asked[key])) for key in changed[:3]]
+        was = "; ".join(f"{key}: {there} there, {here} now" for key, there, here in pairs)
+        other = f"the search there is another ({was}): --name NAME makes one of its own"
+        raise UserError(f"{tuning.study.name}: {other}")
     study.set_user_attr(ASKED, asked)
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         # Its process is gone, since this one holds the folder: Optuna hands the trial out again.

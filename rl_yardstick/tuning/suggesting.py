@@ -185,9 +185,8 @@ class Suggestions:
         If the user has fixed the batch size, the number of steps is changed instead. The sampler
         keeps the parameters that it drew.
         """
-        names, fixed = ("n_steps", "batch_size"), self.tuning.agent.settings
-        n_steps, batch_size = (entry.get(name, self.space.defaults[name]) for name in names)
-        n_envs = entry.get("n_envs", 1)
+        fixed, names = self.tuning.agent.settings, ("n_steps", "batch_size", "n_envs")
+        n_steps, batch_size, n_envs = ({**self.space.defaults, **entry}[name] for name in names)
         if batch_size is None:
             return entry
         if "batch_size" not in fixed:
