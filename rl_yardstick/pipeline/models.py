@@ -88,12 +88,13 @@ def find_model(wanted: Wanted) -> Model:
         path = model_in(folder, wanted.which)
     else:
         path = wanted.path
+        with_suffix = path.with_name(f"{path.name}.zip")
+        if not (path / RECORD).exists() and with_suffix.is_file():
+            path = with_suffix  # typed without its suffix, as for SB3
         if path.is_dir():
             path = model_in(path, wanted.which)
         elif wanted.which != "final":
             raise UserError(f"{path} is one model: give its folder for another one of the run")
-        elif not path.exists() and path.with_name(f"{path.name}.zip").exists():
-            path = path.with_name(f"{path.name}.zip")
     data = zip_data(path)
     spec = _spec_of(path, data, wanted)
     changes = {**spec.eval_env_kwargs, **wanted.env_kwargs}
