@@ -26,7 +26,7 @@ def evaluations(env_id: str, *, greedily: bool) -> dict[str, Contender]:
 
     Two agents take turns, because the evaluator caches the value of the last policy.
     """
-    spec = TrainSpec(algo="qlearning", env_id=env_id, n_timesteps=STEPS)
+    spec = TrainSpec(algo="qlearning", env_id=env_id, n_timesteps=STEPS, seed=0, noise_std=None)
     evaluator = exact_evaluator(spec)
     assert evaluator is not None
     algorithm: Any = load_algorithm("qlearning")

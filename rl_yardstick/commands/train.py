@@ -216,8 +216,8 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
         path = model_in(path) if path.is_dir() else path
         zip_data(path)
         trained_agent = str(path.absolute())
-    names = ("eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer")
-    names += ("log_interval", "vec_env", "device", "diagnose", "watch_episodes", "gym_packages")
+    names = ["eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer"]
+    names += ["log_interval", "vec_env", "device", "diagnose", "watch_episodes", "gym_packages"]
     spec = read_spec(
         args.algo,
         args.env,

@@ -305,12 +305,15 @@ def load(spec: TrainSpec, path: Path, env: VecEnv | None, **replaced: Any) -> Ba
     content = io.BytesIO(read_bytes(path, MAX_MODEL))
     try:
         if _has_own_load(algorithm):
-            return algorithm.load(content, env=env, **replaced)
+            found: BaseAlgorithm = algorithm.load(content, env=env, **replaced)
+            return found
         with warnings.catch_warnings():
             # About a buffer that the library itself has chosen.
             warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
             classes = own_classes(algorithm, spec.gym_packages)
-            agent = load_model(_loadable(algorithm), content, env, classes=classes, **replaced)
+            agent: BaseAlgorithm = load_model(
+                _loadable(algorithm), content, env, classes=classes, **replaced
+            )
         agent.__class__ = algorithm
         return agent
     except UserError:

@@ -312,7 +312,7 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
 
 def components(value: Any, where: str) -> list[dict[str, Any]]:
     """Wrappers or callbacks in rl_zoo3's forms: a name, ``{name: kwargs}``, or a list of these."""
-    found = []
+    found: list[dict[str, Any]] = []
     for item in value if isinstance(value, list) else [] if value is None else [value]:
         if isinstance(item, str):
             found.append({"name": item})

@@ -125,7 +125,8 @@ def _attributes(root: Any) -> dict[str, Any]:
 
 def _writer(root: Any) -> ResultsWriter | None:
     """The open ``monitor.csv`` of a Monitor."""
-    return vars(root).get("results_writer")
+    found: ResultsWriter | None = vars(root).get("results_writer")
+    return found
 
 
 def _position(root: Any) -> int:
@@ -152,7 +153,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         if isinstance(obj, th.UntypedStorage):
             return _storage, (bytes(np.asarray(th.empty(0, dtype=th.uint8).set_(obj))),)
         if type(obj) is np.ndarray and obj.base is not None and not obj.dtype.hasobject:
-            base = obj
+            base: Any = obj
             while isinstance(base, np.ndarray) and base.base is not None:
                 base = base.base
             address = obj.__array_interface__["data"][0]
@@ -177,7 +178,7 @@ class _Unpickler(pickle.Unpickler):
 
 def _storage(content: bytes) -> th.UntypedStorage:
     if not content:
-        return th.UntypedStorage(0)
+        return th.UntypedStorage(0)  # type: ignore[no-untyped-call]
     return th.frombuffer(bytearray(content), dtype=th.uint8).untyped_storage()
 
 
