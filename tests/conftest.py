@@ -127,6 +127,7 @@ def own_folder(monkeypatch, tmp_path):
     """A user's folder, in which commands are typed; what is imported from there goes afterwards."""
     import gymnasium as gym
 
+    import rl_yardstick.envs  # noqa: F401  # before the registry is looked at
     from rl_yardstick.agents import ALGORITHMS
 
     (tmp_path / "own").mkdir()

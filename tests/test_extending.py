@@ -31,7 +31,6 @@ def test_the_document_can_be_followed(type_in_own_folder, own_folder):
             assert "no state can be kept" not in out
     assert gym.make("my/Corridor-v0").unwrapped.length == 6
     logs = own_folder / "logs"
-    assert (logs / "qlearning" / "my-Corridor-v0_1" / "modules" / "my_corridor.py").is_file()
     assert len(list(logs.glob("studies/*/runs/*/my-Corridor-v0_*/run.json"))) == 8
 
 
@@ -88,7 +87,7 @@ def test_a_rule_or_an_index_is_one_file(own_folder, type_in_own_folder, name, te
         assert 0 < record["regret"] < 100  # of 200 pulls, each of which can cost half a click
         return
     assert record["engine"] == "compiled"
-    assert record["spec"]["hyperparams"]["caution"] == 0.3
+    assert record["spec"]["algorithm"]["caution"] == 0.3
     # A wrong value of its setting is refused in a line.
     code, _, err = type_in_own_folder(*command[:-1], "caution:2")
     assert (code, err.count("\n")) == (2, 1)

@@ -71,7 +71,7 @@ def facts_block(env_id: str, *arguments: str) -> str:
 
 def made(env_id: str, *arguments: str) -> gym.Env[Any, Any]:
     """The environment with arguments such as ``size:20``, values being words or numbers."""
-    return gym.make(env_id, **parse_assignments(arguments))
+    return gym.make(env_id, **parse_assignments(arguments, env_id))
 
 
 def optima_block(*written: str) -> str:
