@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import os
 import sys
 from contextlib import suppress
@@ -38,6 +39,9 @@ def run_command(name: str) -> NoReturn:
     number of a signal.
     """
     gc.set_threshold(100_000)  # importing the libraries makes many objects that stay
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal may know ASCII alone
     code = _exit_code(name)
     with suppress(OSError):
         sys.stdout.flush()

@@ -284,7 +284,7 @@ def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dic
     engines = [kind[1:] for kind in arguments_of(algo).get("engine", []) if kind.startswith("=")]
     if word in engines:
         return {**settings, "engine": word}
-    if not engines and word == "auto":
+    if not engines and word in ("auto", "library"):
         return dict(settings)
     has = f"the engines {', '.join(engines)}" if engines else "one engine, which auto means"
     raise UserError(f"--engine {word}: {algo} has {has}")

@@ -56,6 +56,10 @@ class ClusterWorkers(Workers):
         self._cluster: Any = None
         if n_jobs and not where.endswith((".yml", ".yaml")):
             raise UserError("--jobs is for this machine or a queue of jobs: leave it out")
+        is_file = where.endswith((".yml", ".yaml")) or Path(where).is_file()
+        if not is_file and not where.rpartition(":")[2].isdecimal():
+            forms = "ADDRESS:PORT, a scheduler's file, a YAML of dask-jobqueue, or local:N"
+            raise UserError(f"--cluster {where}: give {forms}")
 
     def submit(self, planned: PlannedRun, command: str) -> Future[None]:
         """Do a run as soon as a worker is free."""
@@ -104,9 +108,6 @@ class ClusterWorkers(Workers):
             self._cluster = _job_queue(Path(self.where), self.n_jobs)
         elif Path(self.where).is_file():
             return Client(scheduler_file=self.where)
-        elif not number.rpartition(":")[2].isdecimal():
-            forms = "ADDRESS:PORT, a scheduler's file, a YAML of dask-jobqueue, or local:N"
-            raise ValueError(f"give {forms}")
         return Client(self._cluster or self.where)
 
 
