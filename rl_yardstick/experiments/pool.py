@@ -153,7 +153,7 @@ class Workers:
 
 def process_pool(n_workers: int) -> ProcessPool:
     """A pool of processes that have imported the libraries, and use one thread each."""
-    context = multiprocessing.get_context("spawn" if _WINDOWS_OR_MAC else "forkserver")
+    context: Any = multiprocessing.get_context("spawn" if _WINDOWS_OR_MAC else "forkserver")
     context.set_forkserver_preload(["rl_yardstick.pipeline.training"])
     for library in ("OMP", "MKL", "OPENBLAS"):  # small networks are slower with more
         os.environ[f"{library}_NUM_THREADS"] = "1"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import os
 import stat
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 NO_LIMIT = 1 << 62  # bytes
@@ -65,10 +67,10 @@ class Budget:
 
 def memory_bytes() -> int:
     """The memory of this machine in bytes; 16 GB if the system does not report it."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return 16 << 30
+    if sys.platform != "win32":
+        with suppress(ValueError, OSError):
+            return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return 16 << 30
 
 
 def opened(path: Path, limit: int) -> io.BufferedReader:
