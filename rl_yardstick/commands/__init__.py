@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gc
 import io
 import os
@@ -23,6 +24,19 @@ COMMANDS = {
 }
 
 
+# For terminals that know ASCII alone.
+PLAIN = {"±": "+-", "…": "...", "∞": "inf", "×": "x", "–": "-", "━": "-"}  # noqa: RUF001
+
+
+def _plain(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeEncodeError)
+    text = error.object[error.start : error.end]
+    return "".join(PLAIN.get(sign, "?") for sign in text), error.end
+
+
+codecs.register_error("plain", _plain)
+
+
 def main() -> NoReturn:
     """``yardstick COMMAND`` and ``python -m rl_yardstick COMMAND``."""
     command = sys.argv[1] if len(sys.argv) > 1 else ""
@@ -41,7 +55,7 @@ def run_command(name: str) -> NoReturn:
     gc.set_threshold(100_000)  # importing the libraries makes many objects that stay
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal may know ASCII alone
+            stream.reconfigure(errors="plain")
     code = _exit_code(name)
     with suppress(OSError):
         sys.stdout.flush()

@@ -53,12 +53,20 @@ class OneLineParser(argparse.ArgumentParser):
         kind = argparse.RawDescriptionHelpFormatter
         super().__init__(allow_abbrev=False, formatter_class=kind, epilog=epilog, **kwargs)
 
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse's; the words are kept for hints."""
+        self._typed = sys.argv[1:] if args is None else list(args)
+        return super().parse_args(args, namespace)
+
     def error(self, message: str) -> NoReturn:
         """Raise the mistake as `UserError`."""
         unknown = message.removeprefix("unrecognized arguments: ")
         if unknown != message:
             flags = [flag for action in self._actions for flag in action.option_strings]
-            text = hint(unknown.split(), flags)
+            words = unknown.split()
+            if words and words[0] in self._typed:  # with a value that was taken for a model
+                words = self._typed[self._typed.index(words[0]) :]
+            text = hint(words, flags)
             message = f"unknown argument {unknown}{': ' if text else ''}{text}"
         raise UserError(f"{message} (see --help)")
 

@@ -25,11 +25,12 @@ MAX_ARRAYS = 1 << 31  # bytes of an archive of arrays
 LONGEST_NAME = 100  # bytes; Windows limits a whole path to 260 characters
 
 _REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
+_DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d) *(\.|$)", re.IGNORECASE)  # of Windows
 
 
 def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
     """The name, or a similar one of at most ``longest`` bytes that is valid on every system."""
-    plain = _REFUSED_SIGNS.sub("_", name) or "_"
+    plain = _DEVICE.sub(r"\1_", _REFUSED_SIGNS.sub("_", name)) or "_"
     if plain == name and len(name.encode()) <= longest:
         return name
     digest = hashlib.sha256(name.encode(errors="replace")).hexdigest()[:8]

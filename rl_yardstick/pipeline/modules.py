@@ -15,12 +15,15 @@ from rl_yardstick.pipeline.errors import UserError, one_line
 def import_modules(typed: Iterable[str]) -> None:
     """Import modules by name or by file; the current folder comes first, as with ``python -m``.
 
+    Without any name the current folder is not searched: it may be a stranger's.
+
     Raises:
         UserError: if there is no such module, or importing it fails.
     """
-    if str(Path.cwd()) not in sys.path[:1]:
+    names = list(typed)
+    if names and str(Path.cwd()) not in sys.path[:1]:
         sys.path.insert(0, str(Path.cwd()))
-    for name in typed:
+    for name in names:
         try:
             if name.endswith(".py") or "/" in name:
                 _import_file(Path(name).expanduser())

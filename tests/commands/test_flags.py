@@ -116,7 +116,7 @@ MEANINGS = [
     (TRAIN, "--num-threads", {"-1": -1, "4": 4}, "-2 1025 text"),
     (COMPARE, "--seeds", {"1e1": 10}, "0 -1 1000001"),
     (COMPARE, "--margin", {"0": 0.0, "0.5": 0.5}, "-1 nan inf"),
-    (COMPARE, "--name", {"my study": "my study"}, ".. a/b / a:b"),
+    (COMPARE, "--name", {"my study": "my study"}, ".. a/b / CON a:b nul.txt"),
 ]
 
 
@@ -201,7 +201,7 @@ MEANT = [
     (TRAIN, "--lr 0.1", "behind -params: -params learning_rate:0.1 "),
     (TRAIN, "--epsilon 0.1 --algo dqn", "-params exploration_final_eps:0.1 "),
     (TRAIN, "-yaml x.yml", "did you mean '--conf-file'?"),
-    (ENJOY, "--gamma 0.9", "hyperparameters can only be set in train: -params gamma:VALUE "),
+    (ENJOY, "--gamma 0.9", "hyperparameters can only be set in train: -params gamma:0.9 "),
     (COMPARE, "--seed 3", "did you mean '--seeds'?"),
     (COMPARE, "--see 3", "unknown argument --see"),  # no abbreviation is taken
 ]

@@ -120,7 +120,10 @@ def test_statistics_in_a_hand_written_agents_folder(type_in_own_folder, own_fold
     (run / ENV).mkdir()
     (run / ENV / "vecnormalize.pkl").write_bytes(payload)
     model = run / f"{ENV}.zip"
-    assert type_in_own_folder("enjoy.py", model, *PLAY)[0] == 0  # it was trained without any
+    # The run was trained without any, so playing it does not read this file.
+    assert type_in_own_folder("enjoy.py", model, *PLAY)[0] == 0
+    words = ["--algo", "random", "--env", ENV, "-n", "8", "-i", model]
+    check_refused(type_in_own_folder("train.py", *words), mark, "vecnormalize.pkl")
     (run / ENV / "vecnormalize.pkl").rename(own_folder / "named.pkl")
     words = [model, "--vec-normalize", "named.pkl", *PLAY]
     check_refused(type_in_own_folder("enjoy.py", *words), mark, "named.pkl")
@@ -166,3 +169,21 @@ def test_a_study_asks_for_a_module(type_in_own_folder, own_folder):
     answer = type_in_own_folder("compare.py", study, "--no-report")
     check_refused(answer, study.with_name("mark"), "--gym-packages extra")
     assert "extra" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("module", "packages"),
+    [("rl_zoo3.wrappers", []), ("stable_baselines3.extra", ["--gym-packages", "mine"])],
+)
+def test_settings_name_a_class_of_a_strangers(type_in_own_folder, own_folder, module, packages):
+    """A name in a file means a class of what is installed, or of a module that was typed."""
+    path = own_folder / f"{module.replace('.', '/')}.py"
+    path.parent.mkdir()
+    path.write_text("import gymnasium\nclass Stray(gymnasium.Wrapper): pass\n" + MODULE)
+    (own_folder / "mine.py").write_text("x = 1\n")
+    settings = f"CartPole-v1:\n  n_timesteps: 8\n  env_wrapper: {module}.Stray\n"
+    (own_folder / "settings.yml").write_text(settings)
+    words = ["--algo", "random", "--env", "CartPole-v1", "--conf-file", "settings.yml"]
+    answer = type_in_own_folder("train.py", *words, *packages)
+    check_refused(answer, own_folder / "logs", f"env_wrapper: {module}.Stray: ")
+    assert not list(own_folder.rglob("mark"))

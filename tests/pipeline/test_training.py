@@ -109,7 +109,11 @@ class Sick(gym.Env):
     ("fault", "kind", "said"),
     [
         ("reward", UserError, "reward of environment 0 at step 30 is inf"),
-        ("observation", UserError, "observation of .*environment 0 at step 30 is nan"),
+        (
+            "observation",
+            UserError,
+            "last observation of an episode of environment 0 at step 30 is nan",
+        ),
         ("error", RuntimeError, "the motor is broken"),  # of the user's own code, as it is
         ("exit", SystemExit, "enough"),
     ],
