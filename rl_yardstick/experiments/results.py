@@ -64,7 +64,8 @@ def read_episodes(folder: Path) -> Episodes:
     steps = np.concatenate([len(paths) * table[:, 1].cumsum() for table in tables])
     order = np.argsort(steps, kind="stable")
     rows = np.concatenate(tables)[order]
-    return Episodes(steps[order], rows[:, 0], rows[:, 2])
+    # Episodes that end in one step are written a moment after each other, in no fixed order.
+    return Episodes(steps[order], rows[:, 0], np.maximum.accumulate(rows[:, 2]))
 
 
 def _monitor_table(path: Path) -> Floats:

@@ -15,6 +15,7 @@ from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.results import (
     RUN_COLUMNS,
     mixed_versions,
+    read_episodes,
     read_results,
     threshold_of,
     values_over_seeds,
@@ -158,6 +159,14 @@ def test_learning_curves_by_step_episode_and_time(tmp_path):
     training = curves[curves["kind"] == "training"]
     assert training["value"].iloc[[0, 1, -1]].tolist() == [1.0, 4.0, 249.0]
     assert training["episode"].iloc[[0, 1, -1]].tolist() == [3, 6, 250]
+
+
+def test_environments_that_end_together_are_written_one_after_the_other(tmp_path):
+    for number, seconds in enumerate((0.5, 0.2, 0.9)):
+        (tmp_path / f"{number}.monitor.csv").write_text(f"#\nr,l,t\n1,4,{seconds}\n2,4,{2}\n")
+    episodes = read_episodes(tmp_path)
+    assert episodes.steps.tolist() == [12, 12, 12, 24, 24, 24]
+    assert episodes.seconds.tolist() == [0.5, 0.5, 0.9, 2, 2, 2]
 
 
 def test_runs_that_were_read_are_not_read_again(tmp_path):
