@@ -76,7 +76,7 @@ def main() -> None:
     args = arguments("Figure 5.2 of Sutton and Barto: Blackjack's policy.", N_EPISODES)
     shown, blackjack = observations(), model()
     n_observed = blackjack.n_states - 11
-    best = finite_horizon_optimum(blackjack, LONGEST).actions(0)[:n_observed].astype(np.int64)
+    best = finite_horizon_optimum(blackjack, LONGEST).policy[0, :n_observed].astype(np.int64)
     actions = learnt(args.runs).policy.q_table.argmax(axis=1)
     figure = Figure(figsize=(8, 6.4), layout="constrained")
     for axes, (title, policy) in zip(

@@ -1,8 +1,4 @@
-"""Compiling with Numba: decorators, a cache of machine code keyed by sources, compile times.
-
-The package imports no other package of this project. `cache.COMPILED` names the packages whose
-machine code is cached on disk.
-"""
+"""Compiling with Numba: decorators, a cache of machine code keyed by sources, compile times."""
 
 from __future__ import annotations
 

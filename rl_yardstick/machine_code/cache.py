@@ -1,12 +1,9 @@
 """A disk cache of machine code, in a folder that is named by the sources.
 
-Numba caches the machine code of a function, and discards it when the function's own file changes.
-It misses changes in a function of another file that was inlined. Here the cache of all functions
-is in a folder named by a digest of every source that the machine code depends on, and of the
-versions of Python, Numba and NumPy. After a change of a source the digest differs, so stale code
-is never loaded. Numba itself keeps the code of different processors apart.
-
-Code that depends on other sources, such as a user's own update rule, is not cached.
+Numba discards the cached code of a function when the function's own file changes, but not when an
+inlined function of another file does. So all code is in a folder named by a digest of every source
+that it depends on, and of the versions of Python, Numba and NumPy. Numba itself keeps the code of
+different processors apart. Code with other sources, such as a user's update rule, is not cached.
 """
 
 # mypy: allow-untyped-calls
@@ -14,13 +11,15 @@ Code that depends on other sources, such as a user's own update rule, is not cac
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import logging
 import os
 import platform
+import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,14 +27,13 @@ from typing import Any
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator, NullCache
 
-from rl_yardstick.machine_code.sources import ROOT, source_digest
+ROOT = Path(__file__).resolve().parent.parent  # the folder of `rl_yardstick`, with all packages
 
 # The packages with compiled functions; their machine code depends on no other package.
 COMPILED = ("agents", "machine_code", "mdp")
 OWN_MODULES = tuple(f"rl_yardstick.{package}." for package in COMPILED)
 
-# Folders of other digests to keep, for switching between versions.
-KEPT_BESIDE = 3
+KEPT_BESIDE = 3  # folders of other digests to keep, for switching between versions
 
 # The first field of a settings record starts with this; the algorithm's module and class follow.
 RULE_PREFIX = "rule "
@@ -44,27 +42,25 @@ logger = logging.getLogger(__name__)
 
 
 def digest() -> str:
-    """Digest of sources and compilers as they are now."""
+    """Digest of sources and compilers as they are now, 16 hexadecimal digits."""
     settings: Any = numba.config
     compilers = [importlib.metadata.version(name) for name in ("numba", "numpy", "llvmlite")]
-    options = platform.python_version(), str(settings.OPT), str(settings.BOUNDSCHECK)
-    return source_digest(COMPILED, *compilers, *options)
-
-
-def parents() -> Iterator[Path]:
-    """Folders that may hold the cache, the best first."""
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    if given:
-        yield Path(given) / "yardstick"
-    yield ROOT / "__pycache__" / "machine_code"
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
-    yield Path(home) / "yardstick" / "machine_code"
+    options = platform.python_version(), settings.OPT, settings.BOUNDSCHECK
+    found = hashlib.sha256(repr((compilers, options)).encode())
+    for path in sorted(path for package in COMPILED for path in (ROOT / package).rglob("*.py")):
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        found.update(f"{path.relative_to(ROOT).as_posix()} {content}\n".encode())
+    return found.hexdigest()[:16]
 
 
 @cache
 def folder() -> Path | None:
     """The cache folder of this process's sources; None where none can be written."""
-    for parent in parents():
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
+    parents = [ROOT / "__pycache__" / "machine_code", Path(home) / "yardstick" / "machine_code"]
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        parents.insert(0, Path(given) / "yardstick")
+    for parent in parents:
         chosen = parent / digest()
         try:
             chosen.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -85,39 +81,14 @@ def remove_old(used: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def is_compiled_before(name: str) -> bool:
-    """Whether the cache holds machine code of a function, for any argument types."""
-    found = folder()
-    return found is not None and any(found.glob(f"*/*.{name}-*.nbi"))
-
-
-def modules_of(kind: Any) -> Iterator[str]:
-    """The modules that define the classes and rules in argument types, or in one such type."""
-    if isinstance(kind, tuple | list):
-        for part in kind:
-            yield from modules_of(part)
-        return
-    instance_class = getattr(kind, "instance_class", None)
-    if instance_class not in (None, tuple):
-        yield instance_class.__module__
-    for name in getattr(kind, "fields", ()):
-        if isinstance(name, str) and name.startswith(RULE_PREFIX):
-            yield name.removeprefix(RULE_PREFIX).partition(" ")[0]
-    for part in (getattr(kind, "dtype", None), *getattr(kind, "types", ())):
-        if part is not None and part is not kind:
-            yield from modules_of(part)
-
-
 class Locator(InTreeCacheLocator):
-    """The cache folder of one function's file."""
-
-    def __init__(self, function: Callable[..., object], file: str) -> None:
-        super().__init__(function, file)
-        self._cache_path = str(Path(str(folder())) / self.get_suitable_cache_subpath(file))
+    """The place of one file's machine code, in the common folder."""
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Locator:
-        return cls(py_func, py_file)
+        locator = cls(py_func, py_file)
+        locator._cache_path = f"{folder()}/{locator.get_suitable_cache_subpath(py_file)}"
+        return locator
 
     def get_source_stamp(self) -> str:
         return ""  # the folder's name contains the digest of the sources
@@ -151,12 +122,13 @@ class KeyedCache(FunctionCache):
             logger.warning("the machine code of %s is not kept: %s", self._name, error)
 
 
+def _is_keyed(signature: Any) -> bool:
+    """Whether all rules are ours whose settings are among the arguments."""
+    rules = re.findall(rf"{RULE_PREFIX}([\w.]+)", str(signature))
+    return all(f"{module}.".startswith(OWN_MODULES) for module in rules)
+
+
 def cache_of(function: Callable[..., object]) -> FunctionCache | NullCache:
     """The cache for a function's machine code: none for functions of users."""
     is_own = function.__module__.startswith(OWN_MODULES)
     return KeyedCache(function) if is_own and folder() is not None else NullCache()
-
-
-def _is_keyed(signature: Any) -> bool:
-    arguments = getattr(signature, "args", signature)
-    return all(f"{module}.".startswith(OWN_MODULES) for module in modules_of(arguments))

@@ -1,13 +1,9 @@
 """The decorators of compiled functions.
 
-Numba's own decorator would hide the signatures of functions. These keep them, and set the options
-in one place: machine code is cached by `machine_code.cache`, nothing compiles before the first
-call, and floating-point arithmetic follows IEEE 754.
-
-For each function Numba makes machine code, with a wrapper for Python and another for C. A function
-that only compiled functions call needs none of these: each caller compiles it into its own code.
-Such a `Part` is compiled only to LLVM's intermediate representation (IR), and not cached on disk,
-since the cached code of its callers contains it.
+They keep the types of functions, which Numba's own would hide. Nothing compiles before the first
+call, and machine code is cached by `machine_code.cache`. A function that only compiled functions
+call needs no machine code of its own, and no wrappers for Python and C: such a `Part` is compiled
+to LLVM's intermediate representation (IR), and from there into the code of each caller.
 """
 
 # mypy: allow-untyped-calls
@@ -33,6 +29,8 @@ from rl_yardstick.machine_code.cache import cache_of
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
+IS_INTERPRETED: bool = bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
+
 # Division by zero follows IEEE 754 and raises nothing: checks for it would hinder the compiler in
 # optimising across calls.
 OPTIONS: dict[str, Any] = {"error_model": "numpy"}
@@ -41,107 +39,11 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 # for functions that allocate nothing: their caller in Python keeps all arrays alive.
 BARE_OPTIONS: dict[str, Any] = {**OPTIONS, "_nrt": False}
 
-# Fast-math flags for single precision, so that loops are vectorised: sums in any order, fused
-# multiply-add, and no sign of zero. Infinities and NaN keep their meaning.
-REORDERED_OPTIONS: dict[str, Any] = {**BARE_OPTIONS, "fastmath": {"reassoc", "contract", "nsz"}}
-
 INLINED_OPTIONS: dict[str, Any] = {**BARE_OPTIONS, "forceinline": True}
 
-
-def compiled(function: Function) -> Function:
-    """Compile a function of numbers and arrays on its first call."""
-    return _decorated(function, OPTIONS)
-
-
-def kernel(function: Function) -> Function:
-    """Compile a long loop that allocates nothing."""
-    return _decorated(function, BARE_OPTIONS)
-
-
-def called(function: Function) -> Function:
-    """Compile a function that allocates nothing and that only compiled functions call."""
-    return _part(function, BARE_OPTIONS)
-
-
-def vectorised(function: Function) -> Function:
-    """As `called`, for loops over single-precision numbers whose sums may be in any order."""
-    return _part(function, REORDERED_OPTIONS)
-
-
-def inlined(function: Function) -> Function:
-    """Compile a small function that allocates nothing into its callers."""
-    if is_interpreted():
-        return function
-    return cast(Function, called_as_part(_decorated(function, INLINED_OPTIONS), INLINED_OPTIONS))
-
-
-def internal(function: Function) -> Function:
-    """As `inlined`, for functions that Python does not call."""
-    return _part(function, INLINED_OPTIONS)
-
-
-def view(function: Function) -> Function:
-    """Compile a function that returns a view of an array into its callers.
-
-    Without reference counts, only the caller's own code may make a view.
-    """
-    return _decorated(function, {**BARE_OPTIONS, "inline": "always"})
-
-
-def is_interpreted() -> bool:
-    """Whether NUMBA_DISABLE_JIT turns compiling off."""
-    return bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
-
-
-def _part(function: Function, options: dict[str, Any]) -> Function:
-    return function if is_interpreted() else cast(Function, Part(function, options))
-
-
-def _decorated(function: Function, options: dict[str, Any]) -> Function:
-    if is_interpreted():
-        return function
-    dispatcher = numba.njit(**options)(function)
-    dispatcher._cache = cache_of(function)
-    return cast(Function, dispatcher)
-
-
-# The time that compiling takes.
-
-
-class _CompileTimer(event.Listener):
-    """Sums the compile time; a compilation within another counts once."""
-
-    def __init__(self) -> None:
-        self.depth = 0
-        self.began = self.spent = WorkTime()
-
-    def on_start(self, event: object) -> None:
-        if self.depth == 0:
-            self.began = WorkTime.now()
-        self.depth += 1
-
-    def on_end(self, event: object) -> None:
-        self.depth -= 1
-        if self.depth == 0:
-            self.spent += WorkTime.now() - self.began
-
-
-@contextmanager
-def compile_timer() -> Iterator[Callable[[], WorkTime]]:
-    """Measure the compile time of a ``with`` statement, to leave it out of other timings.
-
-    Yields:
-        A function that returns the compile time so far.
-    """
-    timer = _CompileTimer()
-    with event.install_listener("numba:compile", timer):
-        yield lambda: timer.spent
-
-
-# Functions compiled into others.
-
-# The wrapper that unpacks the arrays of a call from Python takes longer to compile than a loop.
-WITHOUT_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+# Without the wrapper that unpacks the arrays of a call from Python, which takes longer to compile
+# than a loop.
+PART_OPTIONS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 class PartLibrary(JITCodeLibrary):
@@ -174,7 +76,7 @@ class Part(CPUDispatcher):
     """A function that is compiled into its callers only."""
 
     def __init__(self, function: Callable[..., object], options: dict[str, Any]) -> None:
-        options = {"nopython": True, **options, **WITHOUT_WRAPPERS}
+        options = {"nopython": True, **options, **PART_OPTIONS}
         super().__init__(function, targetoptions=options, pipeline_class=PartCompiler)
 
     def add_overload(self, result: Any) -> None:
@@ -190,13 +92,67 @@ class Part(CPUDispatcher):
         return super().get_call_template([unliteral(kind) for kind in args], kws)
 
 
-def called_as_part(dispatcher: Any, options: dict[str, Any]) -> Any:
-    """Let compiled callers use a `Part` of a function that Python calls as it is."""
+def _decorator(options: dict[str, Any], *, is_part: bool = False) -> Callable[[Function], Function]:
+    def decorated(function: Function) -> Function:
+        if IS_INTERPRETED:
+            return function
+        if is_part:
+            return cast(Function, Part(function, options))
+        dispatcher = numba.njit(**options)(function)
+        dispatcher._cache = cache_of(function)
+        return cast(Function, dispatcher)
 
-    @cache
-    def part() -> Part:
-        return Part(dispatcher.py_func, options)
+    return decorated
 
+
+# Compiles a function of numbers and arrays on its first call.
+compiled = _decorator(OPTIONS)
+# Compiles a long loop that allocates nothing.
+kernel = _decorator(BARE_OPTIONS)
+# Compiles a function that allocates nothing and that only compiled functions call.
+called = _decorator(BARE_OPTIONS, is_part=True)
+# As `called`, for loops over single-precision numbers: sums in any order, fused multiply-add, no
+# sign of zero.
+vectorised = _decorator({**BARE_OPTIONS, "fastmath": {"reassoc", "contract", "nsz"}}, is_part=True)
+# As `inlined`, for functions that Python does not call.
+internal = _decorator(INLINED_OPTIONS, is_part=True)
+# Compiles a function that returns a view of an array into its callers: without reference counts,
+# only the caller's own code may make a view.
+view = _decorator({**BARE_OPTIONS, "inline": "always"})
+
+
+def inlined(function: Function) -> Function:
+    """Compile a small function that allocates nothing into its callers."""
+    if IS_INTERPRETED:
+        return function
+    part = cache(lambda: Part(function, INLINED_OPTIONS))
+    dispatcher: Any = _decorator(INLINED_OPTIONS)(function)  # for Python; callers use the part
     dispatcher.get_call_template = lambda args, kws: part().get_call_template(args, kws)
     dispatcher.get_overload = lambda signature: part().get_overload(signature)
-    return dispatcher
+    return cast(Function, dispatcher)
+
+
+class _CompileTimer(event.Listener):
+    """Sums the compile time; a compilation within another counts once."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self.spent = WorkTime()
+
+    def on_start(self, event: object) -> None:
+        if self.depth == 0:
+            self.spent -= WorkTime.now()
+        self.depth += 1
+
+    def on_end(self, event: object) -> None:
+        self.depth -= 1
+        if self.depth == 0:
+            self.spent += WorkTime.now()
+
+
+@contextmanager
+def compile_timer() -> Iterator[Callable[[], WorkTime]]:
+    """Measure the compile time of a ``with`` statement by the function that it yields."""
+    timer = _CompileTimer()
+    with event.install_listener("numba:compile", timer):
+        yield lambda: timer.spent

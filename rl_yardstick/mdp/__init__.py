@@ -21,13 +21,12 @@ if TYPE_CHECKING:
         state_values,
         state_visitation,
     )
-    from rl_yardstick.mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
+    from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
     from rl_yardstick.mdp.hardness import Hardness, hardness_of
     from rl_yardstick.mdp.large_maps import optimum_far_from_limit
     from rl_yardstick.mdp.planning import Plan, policy_iteration, value_iteration
 
 __all__ = [
-    "FiniteHorizonPlan",
     "Hardness",
     "Plan",
     "PolicyReturn",
@@ -45,20 +44,10 @@ __all__ = [
     "value_iteration",
 ]
 
-_HOMES = {
-    "evaluation": (
-        *("PolicyReturn", "baseline_policies", "baseline_return", "optimal_choices"),
-        *("policy_return", "state_values", "state_visitation"),
-    ),
-    "finite_horizon": ("FiniteHorizonPlan", "finite_horizon_optimum"),
-    "hardness": ("Hardness", "hardness_of"),
-    "large_maps": ("optimum_far_from_limit",),
-    "planning": ("Plan", "policy_iteration", "value_iteration"),
-}
-
 
 def __getattr__(name: str) -> object:
-    for module, names in _HOMES.items():
-        if name in names:
-            return getattr(importlib.import_module(f"rl_yardstick.mdp.{module}"), name)
+    for home in ("planning", "evaluation", "large_maps", "hardness") if name in __all__ else ():
+        module = importlib.import_module(f"rl_yardstick.mdp.{home}")
+        if hasattr(module, name):
+            return getattr(module, name)
     raise AttributeError(f"module 'rl_yardstick.mdp' has no attribute {name!r}")

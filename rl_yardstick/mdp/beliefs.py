@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rl_yardstick.mdp.transition_model import Floats, Ints, TransitionModel
 
@@ -57,12 +56,7 @@ class HiddenModel:
 
     @classmethod
     def of(cls, model: TransitionModel, groups: Ints) -> HiddenModel | None:
-        """Split the states of a model into classes and groups; None if the arrays are too large.
-
-        Args:
-            model: the decision process.
-            groups: the index of each state's observation, shape (S,).
-        """
+        """Split the states of a model into classes and groups; None if the arrays are too large."""
         states = np.flatnonzero(model.reachable)
         possible = model.prob[states] > 0
         going = possible & ~model.terminated[states]
@@ -72,10 +66,9 @@ class HiddenModel:
             np.where(possible, model.reward[states], 0.0),
             going,
         )
-        rows = np.stack([column.reshape(len(states), -1) for column in columns], axis=1)
-        _, first, classes = np.unique(
-            _as_bytes(rows.reshape(len(states), -1)), return_index=True, return_inverse=True
-        )
+        rows = np.hstack([column.reshape(len(states), -1) for column in columns]) + 0.0
+        as_bytes = rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
+        _, first, classes = np.unique(as_bytes, return_index=True, return_inverse=True)
         _, numbers = np.unique(groups[states], return_inverse=True)
         n_classes, n_groups = len(first), int(numbers.max()) + 1
         shape = (model.n_actions, n_classes, n_groups, n_classes)
@@ -97,14 +90,9 @@ class HiddenModel:
 def memory_optimum(model: TransitionModel, groups: Ints, horizon: int) -> Bracket | None:
     """The highest expected return of any policy that depends on the history of observations.
 
-    Args:
-        model: the decision process.
-        groups: the index of each state's observation, from 0 on, shape (S,).
-        horizon: the time limit in steps.
-
-    Returns:
-        The optimum, or bounds on it where too many beliefs are reachable; None where there are too
-        many states and observations for either.
+    Or bounds on it, where too many beliefs are reachable; None where there are too many states and
+    observations for either. ``groups`` holds the index of each state's observation, from 0 on,
+    shape (S,); ``horizon`` is the time limit in steps.
     """
     hidden = HiddenModel.of(model, groups)
     if hidden is None:
@@ -243,8 +231,3 @@ def _points(hidden: HiddenModel, bound: Floats, horizon: int) -> Floats:
     places = np.linspace(0, len(beliefs) - 1, min(len(beliefs), MOST_POINTS)).astype(np.int64)
     spread: Floats = beliefs[places]
     return spread
-
-
-def _as_bytes(rows: NDArray[np.float64]) -> NDArray[np.void]:
-    rows = np.ascontiguousarray(rows) + 0.0
-    return rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()

@@ -1,6 +1,7 @@
 """Exact evaluation of policies, without sampling.
 
-A policy is given in one of three forms. Only the rows of states that it visits are used.
+``model`` is the decision process, ``horizon`` the time limit in steps, and ``policy`` has one of
+three forms. Only the rows of states that it visits are used.
 
 - Float of shape (S, A): the probabilities of the actions in each state.
 - Integer of shape (S,): the action in each state.
@@ -17,16 +18,9 @@ from numpy.typing import NDArray
 from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
 from rl_yardstick.mdp.graph import PolicyChain, reachable_states
-from rl_yardstick.mdp.large_maps import moments_along_ways, moments_by_spreading
+from rl_yardstick.mdp.large_maps import moments_by_spreading, walked
 from rl_yardstick.mdp.planning import action_value
-from rl_yardstick.mdp.transition_model import (
-    AnyInts,
-    Bools,
-    Dynamics,
-    Floats,
-    Ints,
-    TransitionModel,
-)
+from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
 
 @dataclass(frozen=True)
@@ -76,7 +70,7 @@ def policy_return(
     Args:
         model: the decision process.
         policy: in any of its forms.
-        horizon: the time limit in steps, after which the episode is cut off; None for none.
+        horizon: the time limit, after which the episode is cut off; None for none.
         discount: from 0 to 1.
         success: the outcomes that make an episode a success, bool of shape (S, A, K). Outcomes
             that do not end the episode are ignored.
@@ -87,7 +81,13 @@ def policy_return(
     """
     _check(horizon, discount)
     if model.reward_variance is not None:
-        return _with_drawn_rewards(model, policy, horizon, discount, success)
+        # Independent random rewards around the model's means add the expected sum of their
+        # variances, discounted by ``discount**2``, to the variance.
+        settled = replace(model, reward_variance=None)
+        result = policy_return(settled, policy, horizon, discount, success)
+        drawn = replace(settled, reward=model.reward_variance)
+        added = policy_return(drawn, policy, horizon, discount**2).expected_return
+        return replace(result, return_variance=result.return_variance + added)
     policy = canonical_policy(model, policy)
     ends_well = model.terminated if success is None else model.terminated & success
     if horizon is not None:
@@ -101,13 +101,7 @@ def policy_return(
 def state_visitation(model: TransitionModel, policy: Policy, horizon: int | None) -> Floats:
     """The expected number of times that an episode acts in each state, shape (S,).
 
-    Args:
-        model: the decision process.
-        policy: in any of its forms.
-        horizon: the time limit in steps; None for none.
-
-    Raises:
-        ValueError: as ``policy_return``.
+    There is no time limit if ``horizon`` is None. Errors are those of `policy_return`.
     """
     _check(horizon, 1.0)
     policy = canonical_policy(model, policy)
@@ -121,11 +115,7 @@ def state_visitation(model: TransitionModel, policy: Policy, horizon: int | None
 
 
 def baseline_policies(model: TransitionModel) -> list[Floats]:
-    """The policies of agents that have learnt nothing: random first, then each constant action.
-
-    Returns:
-        Policy matrices of shape (S, A), 1 + A of them.
-    """
+    """The matrices (S, A) of policies without learning: random first, then each constant action."""
     shape = (model.n_states, model.n_actions)
     uniform = np.full(model.n_actions, 1 / model.n_actions)
     return [np.broadcast_to(row, shape) for row in (uniform, *np.eye(model.n_actions))]
@@ -148,25 +138,6 @@ def baseline_return(model: TransitionModel, horizon: int, discount: float = 1.0)
         found = episodes.result(discount, model.terminated, with_success=False, floor=floor)
         best = max(best, found.expected_return)
     return best
-
-
-def _with_drawn_rewards(
-    model: TransitionModel,
-    policy: Policy,
-    horizon: int | None,
-    discount: float,
-    success: Bools | None,
-) -> PolicyReturn:
-    """As `policy_return`, with independent random rewards around the model's means.
-
-    Adds the expected sum of their variances, discounted by ``discount**2``, to the variance.
-    """
-    assert model.reward_variance is not None
-    settled = replace(model, reward_variance=None)
-    result = policy_return(settled, policy, horizon, discount, success)
-    drawn = replace(settled, reward=model.reward_variance)
-    added = policy_return(drawn, policy, horizon, discount**2).expected_return
-    return replace(result, return_variance=result.return_variance + added)
 
 
 def _check(horizon: int | None, discount: float) -> None:
@@ -209,15 +180,9 @@ OPTIMAL_TOLERANCE = 1e-9
 
 
 def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats:
-    """The expected undiscounted return of episodes that begin in each state.
+    """The expected undiscounted return of episodes that begin in each state, shape (S,).
 
-    Args:
-        model: the decision process.
-        policy: in any of its forms.
-        horizon: the time limit in steps, all of which are left in each state.
-
-    Returns:
-        Shape (S,); zero for states that no policy reaches.
+    All steps are left there. Zero for states that no policy reaches.
     """
     policy = canonical_policy(model, policy)
     states = np.flatnonzero(model.reachable)
@@ -241,13 +206,9 @@ def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats
 
 
 def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Bools]:
-    """The optimal value of each state, and its optimal actions.
+    """The optimal value of each state, and its optimal actions, with all steps left.
 
     Sutton and Barto, Reinforcement Learning, 2nd edition, section 3.6.
-
-    Args:
-        model: the decision process.
-        horizon: the time limit in steps, all of which are left in each state.
 
     Returns:
         The optimal expected undiscounted returns, shape (S,), zero for states that no policy
@@ -288,20 +249,22 @@ def _returns_under_limit(model: Dynamics, policy: Floats, horizon: int) -> Float
 
 # The forms of a policy.
 
-Policy = NDArray[np.floating] | AnyInts
+Policy = NDArray[np.floating] | NDArray[np.integer]
 
 # Networks work in float32, whose probabilities sum to one within some 1e-7.
 POLICY_TOLERANCE = 1e-5
 
 
 def canonical_policy(model: TransitionModel, policy: Policy) -> Policy:
-    """The policy as a float64 matrix (S, A), or as actions of shape (1 or horizon, S)."""
+    """The policy as a float64 matrix (S, A), or as actions of shape (horizon, S)."""
     if np.issubdtype(policy.dtype, np.integer):
-        actions: AnyInts = np.atleast_2d(policy)
+        actions: NDArray[np.integer] = np.atleast_2d(policy)
         taken = actions[:, model.reachable]
         if taken.min() < 0 or taken.max() >= model.n_actions:
             raise ValueError(f"the policy takes an action outside 0..{model.n_actions - 1}")
-        return actions
+        if len(actions) > 1:
+            return actions
+        return np.eye(model.n_actions)[np.clip(actions[0], 0, model.n_actions - 1)]
     matrix = policy.astype(np.float64)
     total = matrix.sum(axis=1)
     # Written so that a NaN fails.
@@ -357,24 +320,25 @@ class LimitedEpisodes:
         A mean return that is certainly below ``floor`` may be given as minus infinity; only
         without discount.
         """
-        states = self._visited()
+        model, states = self.model, self._visited()
         moments = self.along_ways(states, discount, ends_well)
-        if moments is None and self._is_large(states):
-            mean, variance, length, spread, rate = self._forwards(
-                discount, ends_well, floor
-            ).tolist()
+        is_large = len(states) * self.horizon > MOST_BACKWARDS
+        if moments is None and is_large and self._is_stationary():
+            rows = model.prob, model.next_state, model.terminated, model.reward, ends_well
+            start = self.policy.astype(np.float64), model.initial
+            found = moments_by_spreading(rows, *start, self.horizon, discount, floor)
+            mean, variance, length, spread, rate = found.tolist()
             return PolicyReturn(mean, variance, length, spread, rate if with_success else None)
         if moments is None:
-            arrays = (*self._rows(states), self.model.reward[states], ends_well[states])
+            arrays = (*self._rows(states), model.reward[states], ends_well[states])
             chances = chances_in(self.model, self.policy, states)
             if len(chances) == 1 and ((chances == 0) | (chances == 1)).all():
                 # Keep the rows of these actions only: the sweeps would skip all others each time.
                 taken = np.arange(len(states)), chances[0].argmax(axis=1)
                 arrays = tuple(array[taken][:, None] for array in arrays)
                 chances = np.ones((1, len(states), 1))
-            rows, good = arrays[:4], arrays[4]
-            moments = moments_under_limit(rows, good, chances, self.horizon, discount)
-        return over_starts(self.model.initial[states], moments, with_success=with_success)
+            moments = moments_under_limit(arrays[:4], arrays[4], chances, self.horizon, discount)
+        return over_starts(model.initial[states], moments, with_success=with_success)
 
     def visits(self) -> Floats:
         """The expected number of times that an episode acts in each state, shape (S,)."""
@@ -399,11 +363,7 @@ class LimitedEpisodes:
         return place
 
     def _is_stationary(self) -> bool:
-        is_actions = np.issubdtype(self.policy.dtype, np.integer)
-        return not is_actions or len(self.policy) == 1
-
-    def _is_large(self, states: Ints) -> bool:
-        return self._is_stationary() and len(states) * self.horizon > MOST_BACKWARDS
+        return not np.issubdtype(self.policy.dtype, np.integer)
 
     def along_ways(self, states: Ints, discount: float, ends_well: Bools) -> Floats | None:
         """The moments, if each of the n states has one outcome; None if a state has more.
@@ -412,29 +372,16 @@ class LimitedEpisodes:
         """
         if not self._is_stationary():
             return None
-        if np.issubdtype(self.policy.dtype, np.integer):
-            action = self.policy[0, states].astype(np.int64)
-        else:
-            action = self.policy[states].argmax(axis=1)
-            if (self.policy[states, action] != 1).any():
-                return None
-        outcome = self.model.prob[states, action].argmax(axis=1)
-        at = states, action, outcome
-        if (self.model.prob[at] != 1).any():
+        action = self.policy[states].argmax(axis=1)
+        at = states, action, self.model.prob[states, action].argmax(axis=1)
+        if (self.policy[states, action] != 1).any() or (self.model.prob[at] != 1).any():
             return None
-        following = self._places(states)[self.model.next_state[at]]
-        ends, reward = self.model.terminated[at], self.model.reward[at]
-        return moments_along_ways(following, ends, reward, ends_well[at], self.horizon, discount)
-
-    def _forwards(self, discount: float, ends_well: Bools, floor: float) -> Floats:
-        """The moments (5,) of an episode from the distribution of the starting states."""
-        model = self.model
-        is_actions = np.issubdtype(self.policy.dtype, np.integer)
-        chances = actions_used(model, self.policy) if is_actions else self.policy
-        rows = model.prob, model.next_state, model.terminated, model.reward, ends_well
-        return moments_by_spreading(
-            rows, chances.astype(np.float64), model.initial, self.horizon, discount, floor
-        )
+        moments, following = np.zeros((len(states), 5)), self._places(states)
+        way = following[self.model.next_state[at]], self.model.terminated[at], self.model.reward[at]
+        total = walked(*way, ends_well[at], self.horizon, discount)
+        for place, part in zip((0, 2, 4), total[:3], strict=True):
+            moments[:, place] = part[:-1]
+        return moments
 
 
 # Compiled.
@@ -520,12 +467,7 @@ def _variances(
 
 @compiled
 def visits_under_limit(
-    prob: Floats,
-    next_state: Ints,
-    terminated: Bools,
-    policy: Floats,
-    initial: Floats,
-    horizon: int,
+    prob: Floats, next_state: Ints, terminated: Bools, policy: Floats, initial: Floats, horizon: int
 ) -> Floats:
     """The expected number of steps taken in each state, shape (n,)."""
     visits = np.zeros(len(initial))

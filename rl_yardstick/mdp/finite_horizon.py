@@ -9,14 +9,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.machine_code.compiling import compiled
 from rl_yardstick.mdp.planning import TIE_TOLERANCE, action_value
-from rl_yardstick.mdp.transition_model import (
-    Bools,
-    Dynamics,
-    Floats,
-    Ints,
-    TransitionModel,
-    allowed_actions,
-)
+from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
 # The smallest unsigned integers that hold the actions.
 Actions = NDArray[np.unsignedinteger]
@@ -41,13 +34,6 @@ class FiniteHorizonPlan:
     horizon: int
     start_value: float
 
-    def actions(self, step: int) -> Actions:
-        """The actions (S,) to take after ``step`` steps of the episode, 0 to horizon - 1."""
-        if not 0 <= step < self.horizon:
-            raise ValueError(f"step is {step}, it must lie between 0 and {self.horizon - 1}")
-        row: Actions = self.actions_left[min(self.horizon - step, len(self.actions_left)) - 1]
-        return row
-
     @property
     def policy(self) -> Actions:
         """The actions at each step, shape (horizon, S), in order of time."""
@@ -65,21 +51,15 @@ def finite_horizon_optimum(
     Sutton and Barto, Reinforcement Learning, 2nd edition, chapter 4; Puterman, Markov
     Decision Processes, 1994, section 4.5.
 
-    Args:
-        model: the decision process; rows of unreachable states are ignored.
-        horizon: the time limit in steps, at least 1.
-        discount: from 0 to 1.
-        mask: the actions that may be taken, bool of shape (S, A), or None for all.
-
-    Raises:
-        ValueError: for a horizon or discount out of range, or a malformed mask.
+    Arguments and errors are those of `mdp.planning.value_iteration`, and ``horizon``, the time limit
+    in steps, at least 1.
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, it must be at least 1")
     if not 0 <= discount <= 1:
         raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
     states = np.flatnonzero(model.reachable)
-    allowed = allowed_actions(model, mask)
+    allowed = model.allowed_actions(mask)
     values = np.zeros(model.n_states)
     rows: list[Actions] = []
     for _ in range(horizon):

@@ -1,9 +1,9 @@
-"""The gap between a policy and the optimum by state, exactly and under a time limit.
+"""What the actions of a policy lose against the optimum and gain on its own values, exactly.
 
-The gap is a sum over states and steps: the probability of being in the state at that step, times
-what the policy's action loses there against the best one (the performance difference lemma:
-Kakade and Langford, Approximately Optimal Approximate Reinforcement Learning, 2002, lemma 6.1, here
-with time). Policies have the forms of `mdp.evaluation`.
+Under a time limit, the gap to the optimum is a sum over states and steps: the probability of being
+in the state at that step, times what the policy's action loses there against the best one (the
+performance difference lemma: Kakade and Langford, Approximately Optimal Approximate Reinforcement
+Learning, 2002, lemma 6.1, here with time). Arguments are those of `mdp.evaluation`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,9 @@ import numpy as np
 from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.evaluation import Policy, canonical_policy, chances_in, policy_return
 from rl_yardstick.mdp.finite_horizon import back_up
+from rl_yardstick.mdp.graph import PolicyChain
 from rl_yardstick.mdp.planning import action_value
-from rl_yardstick.mdp.transition_model import (
-    AnyInts,
-    Bools,
-    Dynamics,
-    Floats,
-    TransitionModel,
-    allowed_actions,
-)
+from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
 # The largest number of values to store over all steps, 8 bytes each.
 MOST_VALUES = 30_000_000
@@ -64,11 +58,6 @@ class GapByState:
 
 def gap_by_state(model: TransitionModel, policy: Policy, horizon: int) -> GapByState:
     """Split the gap of a policy over the states in which it acts.
-
-    Args:
-        model: the decision process.
-        policy: in any of its forms.
-        horizon: the time limit in steps.
 
     Raises:
         ValueError: for a malformed policy, and where horizon times states are too many.
@@ -197,7 +186,7 @@ def _optimal_rows(model: TransitionModel, horizon: int) -> Floats:
     With m steps or more left they are those of the last row.
     """
     states = np.flatnonzero(model.reachable)
-    allowed = allowed_actions(model, None)
+    allowed = model.allowed_actions()
     rows = [np.zeros(model.n_states)]
     for _ in range(horizon):
         earlier, actions = np.zeros(model.n_states), np.zeros(model.n_states, np.uint64)
@@ -209,20 +198,123 @@ def _optimal_rows(model: TransitionModel, horizon: int) -> Floats:
     return np.array(rows)
 
 
+# Exact discounted values and advantages of a policy, and the exact expectation of GAE estimates.
+#
+# There is no time limit: agents bootstrap where one cuts an episode off, so their estimates do not
+# depend on it.
+
+# Without discount, an episode surely ends if its probability of ending is within this of one.
+SURELY = 1e-9
+SETTLED = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyValues:
+    """The values of a stationary policy.
+
+    Attributes:
+        values: state values V(s), shape (S,).
+        action_values: action values Q(s, a), shape (S, A).
+        advantages: Q(s, a) - V(s), shape (S, A).
+
+    All are NaN in unreachable states, and, without discount, where the episode may never end.
+    """
+
+    values: Floats
+    action_values: Floats
+
+    @property
+    def advantages(self) -> Floats:
+        """Action values minus state values."""
+        return self.action_values - self.values[:, None]
+
+
+def discounted_values(model: TransitionModel, policy: Floats, discount: float) -> PolicyValues:
+    """The exact values of a policy matrix (S, A), without time limit."""
+    chain = PolicyChain.build(model, policy, model.reachable)
+    unknown = np.zeros(chain.size, np.bool_)
+    if discount == 1:
+        ends = chain.solve(chain.mean(chain.terminated), 1.0, zero=chain.endless)
+        unknown = ends < 1 - SURELY
+    values = np.full(model.n_states, np.nan)
+    found = chain.solve(chain.mean(chain.reward), discount, zero=unknown)
+    values[chain.states] = np.where(unknown, np.nan, found)
+    action_values = model.expected_reward + discount * expected_next(model, values)
+    return PolicyValues(values, np.where(model.reachable[:, None], action_values, np.nan))
+
+
+def expected_next(model: TransitionModel, values: Floats) -> Floats:
+    """Expected value of the state after each action, shape (S, A); 0 after termination."""
+    goes_on = (model.prob > 0) & ~model.terminated
+    following = np.where(goes_on, values[model.next_state], 0.0)
+    mean: Floats = np.einsum("sak,sak->sa", model.prob, following)
+    return mean
+
+
+def expected_estimates(
+    model: TransitionModel,
+    policy: Floats,
+    critic: Floats,
+    discount: float,
+    trace: float,
+    steps: tuple[Ints, Ints, Ints],
+) -> tuple[Floats, Floats]:
+    """The exact expectation of generalised advantage estimates (GAE).
+
+    An estimate is the sum of the TD errors of a critic from the step on, discounted by ``discount``
+    times ``trace``, until the episode ends or is cut off (Schulman, Moritz, Levine, Jordan and
+    Abbeel, High-Dimensional Continuous Control Using Generalized Advantage Estimation, 2016).
+
+    Args:
+        model: the decision process.
+        policy: action probabilities of the policy that takes the steps, shape (S, A).
+        critic: the critic's state values, shape (S,); unreachable states are ignored.
+        discount: gamma.
+        trace: lambda.
+        steps: the states and the actions of N steps, and how many TD errors each estimate sums,
+            all of shape (N,).
+
+    Returns:
+        The expectation of each estimate given its state and action, shape (N,), and given its
+        state alone, shape (N,).
+    """
+    chain = PolicyChain.build(model, policy, model.reachable)
+    leads = ~chain.terminated
+    row, following = chain.row[leads], chain.following[leads]
+    weight = discount * trace * chain.weight[leads]
+    values = np.where(model.reachable, critic, 0.0)
+    errors = model.expected_reward + discount * expected_next(model, values) - values[:, None]
+    of_policy = (policy * errors)[chain.states].sum(axis=1)
+    place = np.cumsum(model.reachable) - 1
+    states, actions, n_left = steps
+    order = np.argsort(n_left, kind="stable")
+    bounds = np.searchsorted(n_left[order], np.arange(int(n_left.max(initial=0)) + 2))
+    given_action, given_state = np.empty(len(states)), np.empty(len(states))
+    later = np.zeros(chain.size)  # expected estimate of each state, with one TD error fewer
+    for n in range(1, len(bounds) - 1):
+        now = of_policy + np.bincount(row, weight * later[following], chain.size)
+        # Converged: more TD errors change only the last digits.
+        is_settled = np.abs(now - later).max() <= SETTLED * max(1.0, np.abs(now).max())
+        here = order[bounds[n] : None if is_settled else bounds[n + 1]]
+        if len(here):
+            at = states[here], actions[here]
+            goes_on = model.prob[at] * ~model.terminated[at]
+            ahead = (goes_on * later[place[model.next_state[at]]]).sum(axis=1)
+            given_action[here] = errors[at] + discount * trace * ahead
+            given_state[here] = now[place[states[here]]]
+        if is_settled:
+            break
+        later = now
+    return given_action, given_state
+
+
 # Compiled. With more steps left than there are rows of values, the last row applies.
 
 
 @called
-def _spread(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    state: int,
-    action: int,
-    weight: float,
-    there: Floats,
-) -> float:
+def _spread(model: Dynamics, state: int, action: int, weight: float, there: Floats) -> float:
     """Move a state's probability to its successors in ``there``; returns the part that goes on."""
+    prob, next_state, terminated, _ = model
     left = 0.0
     for k in range(prob.shape[2]):
         if prob[state, action, k] > 0 and not terminated[state, action, k]:
@@ -245,8 +337,7 @@ def _losses(
 
     In repaired states the policy is greedy for its own values, ``rows``.
     """
-    prob, next_state, terminated, mean_reward = model
-    n_states, n_actions = mean_reward.shape
+    n_states, n_actions = model[3].shape
     losses, visits = np.zeros(n_states), np.zeros(n_states)
     values, weights = np.zeros((n_states, n_actions)), np.zeros(n_actions)
     here = initial.copy()
@@ -275,7 +366,7 @@ def _losses(
                 weight = here[state] * weights[action]
                 if weight > 0:
                     losses[state] += weight * max(now[state] - value, 0.0)
-                    goes_on += _spread(prob, next_state, terminated, state, action, weight, there)
+                    goes_on += _spread(model, state, action, weight, there)
         here = there
         if goes_on == 0:
             break
@@ -285,8 +376,7 @@ def _losses(
 @compiled
 def _policy_rows(model: Dynamics, chances: Floats, repaired: Bools, horizon: int) -> Floats:
     """Values with 0, 1, ... steps left, shape (m, S); repaired states take the best action."""
-    mean_reward = model[3]
-    n_states, n_actions = mean_reward.shape
+    n_states, n_actions = model[3].shape
     rows = np.zeros((horizon + 1, n_states))
     for left in range(1, horizon + 1):
         later, now = rows[left - 1], rows[left]
@@ -319,8 +409,7 @@ def _partings(
     horizon: int,
 ) -> tuple[Floats, Floats]:
     """Probabilities (S,) of the first difference in each state, and its gains (S,)."""
-    prob, next_state, terminated, mean_reward = model
-    n_states, n_actions = mean_reward.shape
+    n_states, n_actions = model[3].shape
     met, gains = np.zeros(n_states), np.zeros(n_states)
     here = initial.copy()
     for step in range(horizon):
@@ -343,7 +432,7 @@ def _partings(
             for action in range(n_actions):
                 weight = here[state] * taken[state, action]
                 if weight > 0:
-                    goes_on += _spread(prob, next_state, terminated, state, action, weight, there)
+                    goes_on += _spread(model, state, action, weight, there)
         here = there
         if goes_on == 0:
             break

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,29 +18,15 @@ from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, Tran
 
 def reachable_states(model: TransitionModel, allowed: Bools) -> Bools:
     """The states that are visited, with positive probability, by allowed actions."""
-    start = model.initial > 0
-    return reached_from(start, model.prob, model.next_state, model.terminated, allowed)
-
-
-def reached_from(
-    start: Bools, prob: Floats, next_state: AnyInts, terminated: Bools, allowed: Bools
-) -> Bools:
-    """The states reachable from ``start`` by allowed actions, with ``start`` itself."""
-    found = start.copy()
     # A single memory layout, so that Numba compiles once.
-    allowed = np.ascontiguousarray(allowed)
-    _flood(prob, next_state, terminated, allowed, found)
-    return found
+    edges = model.prob, model.next_state, model.terminated, np.ascontiguousarray(allowed)
+    return _flooded(*edges, model.initial > 0)
 
 
 @compiled
-def _flood(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    allowed: Bools,
-    found: Bools,
-) -> None:
+def _flooded(
+    prob: Floats, next_state: AnyInts, terminated: Bools, allowed: Bools, found: Bools
+) -> Bools:
     """Add all states reachable from ``found`` to ``found``, in place."""
     n_states, n_actions, n_outcomes = prob.shape
     stack = np.empty(n_states, np.int64)
@@ -63,6 +48,7 @@ def _flood(
                     found[reached] = True
                     stack[height] = reached
                     height += 1
+    return found
 
 
 def steps_to_end(model: TransitionModel, allowed: Bools, target: Bools) -> tuple[Ints, Ints]:
@@ -78,10 +64,7 @@ def steps_to_end(model: TransitionModel, allowed: Bools, target: Bools) -> tuple
     nearest = np.concatenate([np.flatnonzero(steps == 0), np.flatnonzero(steps == 1)])
     order[: len(nearest)] = nearest
     edges = (model.prob, model.next_state, model.terminated, allowed)
-    first = _count_predecessors(*edges)
-    predecessors = np.empty(first[-1], np.int32 if model.n_states < 2**31 else np.int64)
-    _list_predecessors(*edges, first.copy(), predecessors)
-    found = _search_backwards(first, predecessors, steps, order, len(nearest))
+    found = _search_backwards(*_predecessors(*edges), steps, order, len(nearest))
     return steps, order[:found]
 
 
@@ -96,12 +79,17 @@ def end_components(model: TransitionModel, allowed: Bools) -> tuple[Ints, Bools]
         The number of each state's component, shape (S,), -1 for states in none; and the actions
         that stay within the component, bool of shape (S, A).
     """
+    from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
     possible = model.prob > 0
     inside = allowed & ~(possible & model.terminated).any(axis=2)
     while True:
-        _, label = connected_components(_graph(model, inside), connection="strong")
+        edges = possible & inside[:, :, None]
+        states = np.nonzero(edges)[0]
+        ends = np.ones(len(states), np.int8), (states, model.next_state[edges])
+        graph = csr_array(ends, shape=(model.n_states, model.n_states))
+        _, label = connected_components(graph, connection="strong")
         same = label[model.next_state] == label[:, None, None]
         kept = inside & (same | ~possible).all(axis=2)
         if np.array_equal(kept, inside):
@@ -109,24 +97,11 @@ def end_components(model: TransitionModel, allowed: Bools) -> tuple[Ints, Bools]
         inside = kept
 
 
-def _graph(model: TransitionModel, allowed: Bools) -> Any:
-    from scipy.sparse import csr_array
-
-    edges = (model.prob > 0) & allowed[:, :, None]
-    states = np.nonzero(edges)[0]
-    ones = np.ones(len(states), np.int8)
-    shape = (model.n_states, model.n_states)
-    return csr_array((ones, (states, model.next_state[edges])), shape=shape)
-
-
 @compiled
-def _count_predecessors(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    allowed: Bools,
-) -> Ints:
-    """Where each state's list of predecessors begins; the last entry is their total number."""
+def _predecessors(
+    prob: Floats, next_state: AnyInts, terminated: Bools, allowed: Bools
+) -> tuple[Ints, AnyInts]:
+    """Where each state's predecessors begin in a list of all, shape (S + 1,); and that list."""
     n_states, n_actions, n_outcomes = prob.shape
     first = np.zeros(n_states + 1, np.int64)
     for state in range(n_states):
@@ -137,19 +112,7 @@ def _count_predecessors(
                         first[next_state[state, action, k] + 1] += 1
     for state in range(n_states):
         first[state + 1] += first[state]
-    return first
-
-
-@compiled
-def _list_predecessors(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    allowed: Bools,
-    place: Ints,
-    predecessors: AnyInts,
-) -> None:
-    n_states, n_actions, n_outcomes = prob.shape
+    place, predecessors = first.copy(), np.empty(first[-1], np.int32)
     for state in range(n_states):
         for action in range(n_actions):
             if allowed[state, action]:
@@ -158,6 +121,7 @@ def _list_predecessors(
                         reached = next_state[state, action, k]
                         predecessors[place[reached]] = state
                         place[reached] += 1
+    return first, predecessors
 
 
 @compiled
@@ -169,8 +133,8 @@ def _search_backwards(
     while done < found:
         reached = order[done]
         done += 1
-        for place in range(first[reached], first[reached + 1]):
-            state = predecessors[place]
+        for i in range(first[reached], first[reached + 1]):
+            state = predecessors[i]
             if steps[state] < 0:
                 steps[state] = steps[reached] + 1
                 order[found] = state
@@ -252,12 +216,7 @@ class PolicyChain:
         return self.mean((result - mean[self.row]) ** 2)
 
     def solve(
-        self,
-        right: Floats,
-        discount: float,
-        *,
-        zero: Bools | None = None,
-        transposed: bool = False,
+        self, right: Floats, discount: float, *, zero: Bools | None = None, transposed: bool = False
     ) -> Floats:
         """Solve (I - discount P) x = right, with P the probabilities of going on to each state.
 
@@ -277,21 +236,15 @@ class PolicyChain:
         row, following = place[self.row[leads]], place[self.following[leads]]
         if transposed:
             row, following = following, row
-        result = np.zeros(self.size)
-        result[kept] = _solve(row, following, -discount * self.weight[leads], right[kept])
+        result, weight, n = np.zeros(self.size), -discount * self.weight[leads], int(kept.sum())
+        if n <= LARGEST_DENSE:
+            matrix = np.eye(n)
+            np.add.at(matrix, (row, following), weight)
+            result[kept] = np.linalg.solve(matrix, right[kept])
+            return result
+        from scipy.sparse import csc_array, eye_array
+        from scipy.sparse.linalg import splu
+
+        system = eye_array(n, format="csc") + csc_array((weight, (row, following)), shape=(n, n))
+        result[kept] = splu(system).solve(right[kept])
         return result
-
-
-def _solve(row: Ints, column: Ints, weight: Floats, right: Floats) -> Floats:
-    """Solve (I + W) x = right, with the entries of W given one by one."""
-    n = len(right)
-    if n <= LARGEST_DENSE:
-        matrix = np.eye(n)
-        np.add.at(matrix, (row, column), weight)
-        return np.linalg.solve(matrix, right).astype(np.float64)
-    from scipy.sparse import csc_array, eye_array
-    from scipy.sparse.linalg import splu
-
-    system = eye_array(n, format="csc") + csc_array((weight, (row, column)), shape=(n, n))
-    solution: Floats = splu(system).solve(right)
-    return solution

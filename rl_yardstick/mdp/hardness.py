@@ -20,7 +20,7 @@ from rl_yardstick.mdp.evaluation import (
     policy_return,
     state_visitation,
 )
-from rl_yardstick.mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
+from rl_yardstick.mdp.finite_horizon import FiniteHorizonPlan, back_up, finite_horizon_optimum
 from rl_yardstick.mdp.graph import steps_to_end
 from rl_yardstick.mdp.planning import action_value, policy_iteration, surely_ending
 from rl_yardstick.mdp.transition_model import AnyInts, Bools, Dynamics, Floats, TransitionModel
@@ -61,15 +61,15 @@ def hardness_of(model: TransitionModel, horizon: int, success: Bools | None = No
         success: the outcomes that end an episode well, bool of shape (S, A, K), or None.
     """
     plan = finite_horizon_optimum(model, horizon)
-    spanned = diameter(model)
+    largest, connected = diameter(model) or (None, None)
     smallest, mean = action_gaps(model, plan)
     lookahead, effective_horizon = looking_ahead(model, horizon)
     steps, episodes = random_wait(model, model.reward > 0, horizon)
     return Hardness(
         states=model.n_states,
         reachable_states=int(model.reachable.sum()),
-        diameter=None if spanned is None else spanned[0],
-        connected=None if spanned is None else spanned[1],
+        diameter=largest,
+        connected=connected,
         smallest_gap=smallest,
         mean_gap=mean,
         return_variance=policy_return(model, plan.policy, horizon).return_variance,
@@ -238,7 +238,8 @@ def looking_ahead(model: TransitionModel, horizon: int) -> tuple[int | None, flo
     if steps * len(states) > MOST_VALUES or deepest < min(steps, LEAST_DEPTHS):
         return None, None
     best, worst, current = _value_rows(arrays, steps)
-    n_actions = model.n_actions
+    n_actions, order = model.n_actions, np.arange(len(states))
+    everything, actions = np.ones(rows[0].shape[:2], np.bool_), np.zeros(len(states), np.uint64)
     is_random = ((rows[0] > 0).sum(axis=2) > 1).any() or model.reward_variance is not None
     bounded = n_actions > 1 and not is_random
     lookahead, bound = None, float(steps)
@@ -252,7 +253,9 @@ def looking_ahead(model: TransitionModel, horizon: int) -> tuple[int | None, flo
             bound = min(bound, k + math.log(episodes) / math.log(n_actions))
         if lookahead is not None and (k + 1 >= bound or not bounded):
             break
-        _look_further(arrays, current)
+        # A sweep of value iteration, in place: with each number of steps left from one step fewer.
+        for left in range(steps, 0, -1):
+            back_up(arrays, everything, 1.0, order, current[left - 1], current[left], actions)
     return lookahead, bound if bounded and lookahead is not None else None
 
 
@@ -281,8 +284,7 @@ def _longest_episode(
 @compiled
 def _value_rows(model: Dynamics, horizon: int) -> tuple[Floats, Floats, Floats]:
     """Highest and lowest values, and those of random actions, with 0, 1, ... steps left."""
-    mean_reward = model[3]
-    n_states, n_actions = mean_reward.shape
+    n_states, n_actions = model[3].shape
     best = np.zeros((horizon + 1, n_states))
     worst, mean = best.copy(), best.copy()
     for left in range(1, horizon + 1):
@@ -295,19 +297,6 @@ def _value_rows(model: Dynamics, horizon: int) -> tuple[Floats, Floats, Floats]:
             best[left, state], worst[left, state] = highest, lowest
             mean[left, state] = total / n_actions
     return best, worst, mean
-
-
-@compiled
-def _look_further(model: Dynamics, rows: Floats) -> None:
-    """One sweep of value iteration over values with 0, 1, ... steps left, in place."""
-    mean_reward = model[3]
-    n_states, n_actions = mean_reward.shape
-    for left in range(len(rows) - 1, 0, -1):
-        for state in range(n_states):
-            highest = -np.inf
-            for action in range(n_actions):
-                highest = max(highest, action_value(model, state, action, rows[left - 1], 1.0))
-            rows[left, state] = highest
 
 
 @compiled

@@ -14,17 +14,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rl_yardstick.machine_code.compiling import compiled, inlined, kernel
 from rl_yardstick.mdp.planning import value_iteration
-from rl_yardstick.mdp.transition_model import (
-    AnyInts,
-    Bools,
-    Dynamics,
-    Floats,
-    Ints,
-    TransitionModel,
-)
+from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
 # A distant limit.
 
@@ -134,7 +128,7 @@ def drift(model: Dynamics, reached: Bools, values: Floats) -> tuple[float, float
 
 # Spreading.
 
-Rows = tuple[Floats, AnyInts, Bools, Floats, Bools]
+Rows = tuple[Floats, NDArray[np.integer], Bools, Floats, Bools]
 
 # Upper bound on the total probability that is ignored, in states that are unlikely at a step:
 # reached if all states were ignored at all steps.
@@ -208,11 +202,14 @@ def _follow(
     highest rewards of a step that ends the episode and of one that does not.
     """
     now, later, here, there = groups
+    best_end, best_step = limits
     factor = 1.0
     for step in range(horizon):
         n_there, before = 0, over[0, 0]
         hope = over[0, 0] * over[0, 1]
-        to_come = _most_to_come(limits, horizon - step)
+        left, on_the_way = horizon - step, max(best_step, 0.0) * (horizon - step - 1)
+        unfinished = best_step * left if best_step > -np.inf else -np.inf
+        to_come = max(best_end + on_the_way, unfinished)  # the most that the next steps may earn
         for i in range(n_here):
             state = here[i]
             hope += now[state, 0] * (now[state, 1] + to_come)
@@ -286,15 +283,6 @@ def _merge(groups: Floats, place: int, chance: float, mean: float, spread: float
         groups[place, 0] = total
 
 
-@inlined
-def _most_to_come(limits: tuple[float, float], n_steps: int) -> float:
-    """An upper bound on the return of an episode's next ``n_steps`` steps."""
-    best_end, best_step = limits
-    on_the_way = best_step * (n_steps - 1) if best_step > 0 else 0.0
-    unfinished = best_step * n_steps if best_step > -np.inf else -np.inf
-    return max(best_end + on_the_way, unfinished)
-
-
 @compiled
 def _best_rewards(prob: Floats, terminated: Bools, reward: Floats) -> tuple[float, float]:
     """The highest reward of an end, and of any other step; minus infinity without any."""
@@ -317,24 +305,8 @@ def _best_rewards(prob: Floats, terminated: Bools, reward: Floats) -> tuple[floa
 Ways = tuple[Floats, Floats, Bools, Ints]
 
 
-def moments_along_ways(
-    next_state: AnyInts,
-    terminated: Bools,
-    reward: Floats,
-    success: Bools,
-    horizon: int,
-    discount: float,
-) -> Floats:
-    """As `mdp.evaluation.moments_under_limit`, where each state has one outcome."""
-    moments = np.zeros((len(reward), 5))
-    total = _walked(next_state.astype(np.int64), terminated, reward, success, horizon, discount)
-    for place, part in zip((0, 2, 4), total[:3], strict=True):
-        moments[:, place] = part[:-1]
-    return moments
-
-
 @compiled
-def _walked(
+def walked(
     next_state: Ints,
     terminated: Bools,
     reward: Floats,

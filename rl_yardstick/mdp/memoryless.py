@@ -25,13 +25,7 @@ from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.evaluation import policy_return
 from rl_yardstick.mdp.gaps import policy_gradient
 from rl_yardstick.mdp.planning import action_value
-from rl_yardstick.mdp.transition_model import (
-    Bools,
-    Dynamics,
-    Floats,
-    Ints,
-    TransitionModel,
-)
+from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
 # Limits for a search of some seconds. Work is in outcomes and choices of all states at all steps.
 MOST_OUTCOMES_CLIMBED = 100_000_000  # for one return; above, there is no search
@@ -90,10 +84,10 @@ def best_memoryless(
         horizon: the time limit in steps.
         most: a known upper bound on the return.
 
-    Returns:
-        The best policy found, and the bound; None where the search would take too long.
+    Returns None where the search would take too long.
     """
     from scipy.optimize import minimize
+    from scipy.special import softmax
 
     states = np.flatnonzero(model.reachable)
     size = len(states) * model.n_actions * (model.n_outcomes + model.n_actions) * horizon
@@ -105,7 +99,7 @@ def best_memoryless(
 
     def downhill(flat: Floats) -> tuple[float, Floats]:
         logits = flat.reshape(n_groups, n_actions)
-        shares = _softmax(logits)
+        shares = softmax(logits, axis=1)
         value, slope = policy_gradient(model, shares[groups], horizon)
         by_group = np.zeros((n_groups, n_actions))
         np.add.at(by_group, groups, slope)
@@ -135,7 +129,7 @@ def best_memoryless(
         end = minimize(downhill, start.ravel(), jac=True, method="L-BFGS-B", options=most_calls)
         n_calls -= int(end.nfev)
         logits = end.x.reshape(n_groups, n_actions)
-        found.take(_softmax(logits))
+        found.take(softmax(logits, axis=1))
         ends.append(logits.argmax(axis=1))
     most_returns = MOST_WORK // per_firm // max(len(ends), 1)
     for end in () if is_firm_known else ends:
@@ -383,9 +377,3 @@ def _best_in_box(values: Floats, low: Floats, high: Floats, is_used: Bools) -> f
         total += more * values[best]
         left -= more
     return total
-
-
-def _softmax(logits: Floats) -> Floats:
-    powers = np.exp(logits - logits.max(axis=1, keepdims=True))
-    shares: Floats = powers / powers.sum(axis=1, keepdims=True)
-    return shares

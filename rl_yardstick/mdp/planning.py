@@ -19,14 +19,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.graph import PolicyChain, end_components, steps_to_end
-from rl_yardstick.mdp.transition_model import (
-    Bools,
-    Dynamics,
-    Floats,
-    Ints,
-    TransitionModel,
-    allowed_actions,
-)
+from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
 # Beyond this many rounds only plain sweeps are made, which are known to converge.
 ROUNDS_WITH_EVALUATION = 1000
@@ -89,11 +82,9 @@ def value_iteration(
         mask: the actions that may be taken, bool of shape (S, A), or None for all.
 
     Raises:
-        ValueError: for a discount or tolerance out of range, a mask of another shape or that
-            allows nothing in a state, or where the undiscounted optimum is not finite.
+        ValueError: for a discount out of range, a mask that allows nothing in a state, or where
+            the undiscounted optimum is not finite.
     """
-    if not tolerance > 0:
-        raise ValueError(f"tolerance is {tolerance}, it must be positive")
     problem = PlanningProblem.of(model, discount, mask)
     values, policy = problem.start()
     floor = np.where(problem.part.resting, 0.0, -np.inf)
@@ -102,7 +93,9 @@ def value_iteration(
     change = np.inf
     iterations = rough = 0
     while True:
-        if _worth_evaluating(problem, values, change, iterations, solving):
+        # Sweeps over one policy no longer help once only rounding errors are left.
+        is_rough = solving or change > 1e-13 * float(np.abs(values).max())
+        if is_rough and iterations < ROUNDS_WITH_EVALUATION and not problem.part.resting.any():
             order = order[np.argsort(-values[order], kind="stable")]
             if solving:
                 problem.solve(policy, order, values)
@@ -112,11 +105,8 @@ def value_iteration(
                 rough += len(order) if left > enough else 0
                 solving = discount < 1 and rough > ROUGH_STATES
         tie = FINE_TIE if solving else TIE_TOLERANCE
-        allowed = problem.part.allowed
-        rise, fall = improve(
-            model.dynamics, allowed, floor, problem.discount, order, values, policy, tie
-        )
-        change = max(rise, fall)
+        rules = model.dynamics, problem.part.allowed, floor, problem.discount
+        change = improve(*rules, order, values, policy, tie)
         iterations += 1
         exhausted = change <= problem.rounding(values)
         if exhausted or problem.error_bound(values, change) <= tolerance:
@@ -128,23 +118,20 @@ def policy_iteration(model: TransitionModel, discount: float, mask: Bools | None
 
     The linear systems are solved directly, which suits up to some ten thousand states; above, the
     memory needed depends on the model, and ``value_iteration`` is faster. Howard, Dynamic
-    Programming and Markov Processes, 1960.
-
-    Args:
-        model: the decision process; rows of unreachable states are ignored.
-        discount: from 0 to 1; 1 sums rewards until the episode ends.
-        mask: as in ``value_iteration``.
-
-    Raises:
-        ValueError: for a discount out of range, a malformed mask, or where the undiscounted
-            optimum is not finite.
+    Programming and Markov Processes, 1960. Arguments and errors are those of `value_iteration`.
     """
     problem = PlanningProblem.of(model, discount, mask)
     _, policy = problem.start()
     states = problem.order
     iterations = 0
     while True:
-        values = _exact_values(problem, policy)
+        chain = PolicyChain.build(model, np.eye(model.n_actions)[policy], problem.part.states)
+        rests = None
+        if problem.part.resting.any():
+            # An end component of one policy that is never left has no net cost: values are zero.
+            rests = end_components(model, chain.used)[0][chain.states] >= 0
+        values = np.zeros(model.n_states)
+        values[chain.states] = chain.solve(chain.mean(chain.reward), discount, zero=rests)
         action_values = problem.action_values(values)
         iterations += 1
         gain = np.zeros(model.n_states)
@@ -154,30 +141,6 @@ def policy_iteration(model: TransitionModel, discount: float, mask: Bools | None
         if not better.any():
             return _plan(problem, values, float(gain.max()), iterations)
         policy = np.where(better, action_values.argmax(axis=1), policy)
-
-
-def _worth_evaluating(
-    problem: PlanningProblem, values: Floats, change: float, iterations: int, solving: bool
-) -> bool:
-    """Whether to evaluate the policy; sweeps no longer help once only rounding errors are left."""
-    if problem.part.resting.any() or iterations >= ROUNDS_WITH_EVALUATION:
-        return False
-    return solving or change > 1e-13 * float(np.abs(values).max())
-
-
-def _exact_values(problem: PlanningProblem, policy: Ints) -> Floats:
-    model = problem.model
-    taken = np.zeros((model.n_states, model.n_actions))
-    taken[np.arange(model.n_states), policy] = 1.0
-    chain = PolicyChain.build(model, taken, problem.part.states)
-    values = np.zeros(model.n_states)
-    rests = None
-    if problem.part.resting.any():
-        # An end component of a single policy that is never left has no net cost: values are zero.
-        component, _ = end_components(model, chain.used)
-        rests = component[chain.states] >= 0
-    values[chain.states] = chain.solve(chain.mean(chain.reward), problem.discount, zero=rests)
-    return values
 
 
 def _plan(problem: PlanningProblem, values: Floats, change: float, iterations: int) -> Plan:
@@ -222,7 +185,7 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class FinitePart:
-    """Where the undiscounted optimum is finite."""
+    """Where the undiscounted optimum is finite; with a discount, all reachable states."""
 
     # The reachable states whose optimum is finite, bool of shape (S,); from all other reachable
     # states it is minus infinity.
@@ -233,17 +196,9 @@ class FinitePart:
     # A lower bound on the mean cost of steps that cannot end the episode; zero where one is free.
     step_cost: float
 
-    @classmethod
-    def everything(cls, model: TransitionModel, mask: Bools | None = None) -> FinitePart:
-        """All reachable states and their allowed actions, as with a discount below one."""
-        allowed = allowed_actions(model, mask)
-        none = np.zeros_like(allowed)
-        return cls(model.reachable, allowed, np.zeros_like(model.reachable), none, 0.0)
 
-
-def finite_part(model: TransitionModel, mask: Bools | None = None) -> FinitePart:
-    """Find where the undiscounted optimum is finite."""
-    allowed = allowed_actions(model, mask)
+def finite_part(model: TransitionModel, allowed: Bools) -> FinitePart:
+    """Find where the undiscounted optimum of the allowed actions is finite."""
     ends = (model.terminated & (model.prob > 0)).any(axis=2)
     endless = allowed & ~ends
     # Where every step may end the episode, any cost is valid; one of the size of the rewards makes
@@ -351,7 +306,11 @@ class PlanningProblem:
         """Check the discount, and that the optimum is finite."""
         if not 0 <= discount <= 1:
             raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
-        part = finite_part(model, mask) if discount == 1 else FinitePart.everything(model, mask)
+        allowed = model.allowed_actions(mask)
+        if discount == 1:
+            return cls(model, float(discount), finite_part(model, allowed))
+        none = np.zeros_like(allowed)
+        part = FinitePart(model.reachable, allowed, none.any(axis=1), none, 0.0)
         return cls(model, float(discount), part)
 
     @cached_property
@@ -440,7 +399,7 @@ class PlanningProblem:
 
     def action_values(self, values: Floats) -> Floats:
         """Values of shape (S, A), minus infinity for actions that are not allowed."""
-        return action_values(self.model.dynamics, self.part.allowed, self.discount, values)
+        return _action_values(self.model.dynamics, self.part.allowed, self.discount, values)
 
     def rounding(self, values: Floats) -> float:
         """The change of a value that rounding alone may make in one sweep."""
@@ -514,18 +473,17 @@ def improve(
     values: Floats,
     policy: Ints,
     tie: float,
-) -> tuple[float, float]:
+) -> float:
     """One Gauss-Seidel sweep of the Bellman optimality operator, in place.
 
     ``policy`` switches to the best action only where that is better by more than ``tie``, relative
     to the value where that is above 1.
 
     Returns:
-        The largest rise and the largest fall of a value.
+        The largest change of a value.
     """
     prob = model[0]
-    rise = 0.0
-    fall = 0.0
+    largest = 0.0
     for state in order:
         best = -np.inf
         current = -np.inf
@@ -542,11 +500,9 @@ def improve(
         if best > current + tie * max(1.0, abs(best)):
             policy[state] = best_action
         best = max(best, floor[state])
-        change = best - values[state]
-        rise = max(rise, change)
-        fall = max(fall, -change)
+        largest = max(largest, abs(best - values[state]))
         values[state] = best
-    return rise, fall
+    return largest
 
 
 @compiled
@@ -630,11 +586,7 @@ def policy_rows(
 
 @compiled
 def evaluate(
-    weight: Floats,
-    following: NDArray[np.int32],
-    reward: Floats,
-    settled: Floats,
-    values: Floats,
+    weight: Floats, following: NDArray[np.int32], reward: Floats, settled: Floats, values: Floats
 ) -> float:
     """One sweep of the Bellman operator of a policy over its rows, in place; the largest change.
 
@@ -668,7 +620,7 @@ def residuals(
 
 
 @compiled
-def action_values(model: Dynamics, allowed: Bools, discount: float, values: Floats) -> Floats:
+def _action_values(model: Dynamics, allowed: Bools, discount: float, values: Floats) -> Floats:
     """The action values, shape (S, A), that follow from the state values ``values``.
 
     Actions that are not allowed get minus infinity.

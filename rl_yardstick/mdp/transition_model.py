@@ -12,7 +12,7 @@ transitions enter are never used.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -67,13 +67,12 @@ class TransitionModel:
 
     def __post_init__(self) -> None:
         index_type = np.int32 if np.asarray(self.next_state).dtype == np.int32 else np.int64
-        self._freeze("prob", np.float64)
-        self._freeze("next_state", index_type)
-        self._freeze("reward", np.float64)
-        self._freeze("terminated", np.bool_)
-        self._freeze("initial", np.float64)
-        if self.reward_variance is not None:
-            self._freeze("reward_variance", np.float64)
+        types = (np.float64, index_type, np.float64, np.bool_, np.float64, np.float64)
+        for name, dtype in zip((field.name for field in fields(self)), types, strict=True):
+            if (given := getattr(self, name)) is not None:
+                # A view, so that the caller's own array stays writable.
+                view = np.ascontiguousarray(given, dtype).view()
+                object.__setattr__(self, name, _read_only(view))
         self._check_shapes()
         self._check_outcomes()
 
@@ -153,17 +152,27 @@ class TransitionModel:
         These are the possible starting states and all states that transitions reach from them
         without ending the episode. The rows of all other states are meaningless.
         """
-        from rl_yardstick.mdp.graph import reached_from
+        from rl_yardstick.mdp.graph import reachable_states
 
-        allowed = np.ones((self.n_states, self.n_actions), np.bool_)
-        start = self.initial > 0
-        found = reached_from(start, self.prob, self.next_state, self.terminated, allowed)
-        return _read_only(found)
+        everything = np.ones((self.n_states, self.n_actions), np.bool_)
+        return _read_only(reachable_states(self, everything))
 
-    def _freeze(self, name: str, dtype: type[Any]) -> None:
-        """Replace an array by a read-only view, so that the caller's own stays writable."""
-        view = np.ascontiguousarray(getattr(self, name), dtype).view()
-        object.__setattr__(self, name, _read_only(view))
+    def allowed_actions(self, mask: Bools | None = None) -> Bools:
+        """The actions that planning may take, bool of shape (S, A); none in unreachable states.
+
+        Args:
+            mask: bool of shape (S, A), or None for all actions.
+
+        Raises:
+            ValueError: if the mask allows nothing in a reachable state.
+        """
+        reachable = self.reachable[:, None]
+        if mask is None:
+            return np.repeat(reachable, self.n_actions, axis=1)
+        stuck = np.flatnonzero(self.reachable & ~mask.any(axis=1))
+        if stuck.size:
+            raise ValueError(f"the mask allows nothing in state {stuck[0]}")
+        return reachable & mask.astype(np.bool_)
 
     def _check_shapes(self) -> None:
         shape = self.prob.shape
@@ -179,18 +188,16 @@ class TransitionModel:
     def _check_outcomes(self) -> None:
         # Written so that a NaN fails each check.
         self._require((self.prob >= 0) & (self.prob <= 1), "a probability outside [0, 1]")
-        total = self.prob.sum(axis=2)
-        self._require(
-            np.abs(total - 1) <= PROBABILITY_TOLERANCE, "probabilities that do not sum to one"
-        )
+        is_sum = np.abs(self.prob.sum(axis=2) - 1) <= PROBABILITY_TOLERANCE
+        self._require(is_sum, "probabilities that do not sum to one")
         in_range = (self.next_state >= 0) & (self.next_state < self.n_states)
         self._require(in_range, f"a next state outside 0..{self.n_states - 1}")
         self._require(np.isfinite(self.reward), "a reward that is not finite")
         if self.reward_variance is not None:
             valid = np.isfinite(self.reward_variance) & (self.reward_variance >= 0)
             self._require(valid, "a variance of the reward that is negative or not finite")
-        is_sum = abs(self.initial.sum() - 1) <= PROBABILITY_TOLERANCE
-        if not (is_sum and (self.initial >= 0).all()):
+        total = self.initial.sum()
+        if not (abs(total - 1) <= PROBABILITY_TOLERANCE and (self.initial >= 0).all()):
             raise ValueError(f"initial holds no probabilities that sum to one: {self.initial}")
 
     @staticmethod
@@ -198,25 +205,6 @@ class TransitionModel:
         if not valid.all():
             state, action = np.argwhere(~valid)[0][:2]
             raise ValueError(f"state {state}, action {action} has {problem}")
-
-
-def allowed_actions(model: TransitionModel, mask: Bools | None) -> Bools:
-    """The actions that planning may take, bool of shape (S, A); none in unreachable states.
-
-    Args:
-        model: the decision process.
-        mask: bool of shape (S, A), or None for all actions.
-
-    Raises:
-        ValueError: if the mask allows nothing in a reachable state.
-    """
-    reachable = model.reachable[:, None]
-    if mask is None:
-        return np.repeat(reachable, model.n_actions, axis=1)
-    stuck = np.flatnonzero(model.reachable & ~mask.any(axis=1))
-    if stuck.size:
-        raise ValueError(f"the mask allows nothing in state {stuck[0]}")
-    return reachable & mask.astype(np.bool_)
 
 
 def _row(P: Mapping[int, Mapping[int, Outcomes]], state: int, action: int) -> Outcomes:  # noqa: N803

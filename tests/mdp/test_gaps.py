@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rl_yardstick.mdp import finite_horizon_optimum, policy_return
-from rl_yardstick.mdp.advantages import discounted_values, expected_estimates
 from rl_yardstick.mdp.gaps import (
+    discounted_values,
+    expected_estimates,
     first_differences,
     gap_by_state,
     greedy_repairs,

@@ -142,7 +142,6 @@ def test_what_is_best_depends_on_the_steps_left():
         found = finite_horizon_optimum(model, horizon)
         assert found.values.tolist() == [10.0, 10.0]
         assert found.policy[:, 0].tolist() == first_actions
-        assert [found.actions(step)[0] for step in range(horizon)] == first_actions
 
 
 # --- among the actions that a mask allows ---------------------------------------------------------

@@ -264,7 +264,7 @@ def test_optimal_actions_followed_by_the_best_plan_earn_the_optimum(model, horiz
     values, optimal = optimal_choices(model, horizon)
     plan = finite_horizon_optimum(model, horizon)
     np.testing.assert_array_equal(values, plan.values)
-    assert optimal[np.arange(model.n_states), plan.actions(0)].all()
+    assert optimal[np.arange(model.n_states), plan.policy[0]].all()
     reached = model.reachable
     for action in range(model.n_actions):
         first = np.full(model.n_states, action)

@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rl_yardstick.mdp import TransitionModel, policy_return, state_visitation
-from rl_yardstick.mdp.advantages import expected_estimates
+from rl_yardstick.mdp.gaps import expected_estimates
 from rl_yardstick.pipeline.callbacks import StateCallback
 from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.evaluation import critics

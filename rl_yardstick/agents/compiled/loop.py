@@ -15,10 +15,10 @@ from rl_yardstick.agents.common.schedules import schedule_value
 from rl_yardstick.machine_code.cache import RULE_PREFIX
 from rl_yardstick.machine_code.compiling import (
     INLINED_OPTIONS,
-    WITHOUT_WRAPPERS,
+    PART_OPTIONS,
     PartCompiler,
     inlined,
-    is_interpreted,
+    IS_INTERPRETED,
     kernel,
 )
 from rl_yardstick.mdp.transition_model import Floats
@@ -43,7 +43,7 @@ class CompiledOnlyError(TypeError):
 
 def by_type(stub: Function) -> Function:
     """Make a compiled function that calls the function of that name of its first argument."""
-    if is_interpreted():
+    if IS_INTERPRETED:
         raise RuntimeError("agents need Numba's compiler: unset NUMBA_DISABLE_JIT")
     name = stub.__name__
     _NAMES.add(name)
@@ -51,7 +51,7 @@ def by_type(stub: Function) -> Function:
     def choose(thing: Any, *others: Any) -> Any:
         return getattr(getattr(_class_of(thing), name, None), "py_func", None)
 
-    options: Any = {**INLINED_OPTIONS, **WITHOUT_WRAPPERS, "pipeline_class": PartCompiler}
+    options: Any = {**INLINED_OPTIONS, **PART_OPTIONS, "pipeline_class": PartCompiler}
     overload(stub, strict=False, jit_options=options)(choose)
     return stub
 

@@ -38,7 +38,7 @@ from rl_yardstick.agents.networks.engine import NetworkEngine
 from rl_yardstick.agents.networks.perceptron import Inputs, one_thread
 from rl_yardstick.agents.networks.playing import NetworkPlayer, network_player
 from rl_yardstick.agents.networks.torch_bridge import Network, check_optimizer, in_rows
-from rl_yardstick.machine_code.cache import is_compiled_before
+from rl_yardstick.machine_code.cache import folder
 
 # Conditions for compiled trainings of the library's agents.
 
@@ -173,7 +173,9 @@ _LAST_COMPILED = {"q": "learn_from_minibatch", "policy": "learn_from_rollout_min
 
 def compiling_seconds(work: Work) -> float:
     """Seconds of compiling on this machine: 0 if the result is in the cache."""
-    return 0.0 if is_compiled_before(_LAST_COMPILED[work.kind]) else COMPILING
+    code = folder()
+    found = code is not None and any(code.glob(f"*/*.{_LAST_COMPILED[work.kind]}-*.nbi"))
+    return 0.0 if found else COMPILING
 
 
 def machine_pace() -> float:

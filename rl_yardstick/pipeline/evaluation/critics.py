@@ -34,7 +34,7 @@ from rl_yardstick.envs.known_models import (
     transition_model,
 )
 from rl_yardstick.mdp import TransitionModel, state_visitation
-from rl_yardstick.mdp.advantages import PolicyValues, discounted_values, expected_estimates
+from rl_yardstick.mdp.gaps import PolicyValues, discounted_values, expected_estimates
 from rl_yardstick.mdp.graph import LARGEST_DENSE
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.curve_pictures import MEANINGS
