@@ -44,11 +44,7 @@ class ARS(sb3_contrib.ARS):
             return self
 
     def _trigger_callback(
-        self,
-        _locals: dict[str, Any],
-        _globals: dict[str, Any],
-        callback: BaseCallback,
-        n_envs: int,
+        self, _locals: dict[str, Any], _globals: dict[str, Any], callback: BaseCallback, n_envs: int
     ) -> None:
         """Called after a step for each environment whose episode counts; act on the first call."""
         if _locals["dones"] is self._last_dones:

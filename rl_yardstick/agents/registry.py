@@ -157,8 +157,8 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "double_qlearning": _tabular("one_step:DoubleQLearning", "double Q-learning on two tables"),
     "n_step_sarsa": _tabular("n_step:NStepSARSA", "n-step SARSA on a table"),
     "n_step_tree_backup": _tabular("n_step:NStepTreeBackup", "n-step tree backup on a table"),
-    "sarsa_lambda": _tabular("traces:SARSALambda", "SARSA(lambda): traces on a table"),
-    "q_lambda": _tabular("traces:QLambda", "Watkins's Q(lambda): traces on a table"),
+    "sarsa_lambda": _tabular("n_step:SARSALambda", "SARSA(lambda): traces on a table"),
+    "q_lambda": _tabular("n_step:QLambda", "Watkins's Q(lambda): traces on a table"),
     "monte_carlo": _tabular("monte_carlo:MonteCarlo", "on-policy Monte Carlo on a table"),
     "off_policy_monte_carlo": _tabular(
         "monte_carlo:OffPolicyMonteCarlo", "off-policy Monte Carlo on a table"
@@ -185,14 +185,10 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "dqn": _network("DQN", "deep Q-network (Stable-Baselines3)"),
     "double_dqn": _network("DoubleDQN", "DQN with van Hasselt's target", engines=NETWORK_ENGINES),
     "deep_qlearning": _network(
-        "DeepQLearning",
-        "DQN of 2013: squared loss, no target network",
-        engines=NETWORK_ENGINES,
+        "DeepQLearning", "DQN of 2013: squared loss, no target network", engines=NETWORK_ENGINES
     ),
     "ppo": _network(
-        "PPO",
-        "proximal policy optimisation (Stable-Baselines3)",
-        actions=POLICY_GRADIENT_OUTPUTS,
+        "PPO", "proximal policy optimisation (Stable-Baselines3)", actions=POLICY_GRADIENT_OUTPUTS
     ),
     "a2c": _network(
         "A2C", "advantage actor-critic (Stable-Baselines3)", actions=POLICY_GRADIENT_OUTPUTS
@@ -253,13 +249,13 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         DISCRETE,
         observation_shape=(4,),
     ),
-    "epsilon_greedy": _bandit("value_bandits:EpsilonGreedy", "bandit: epsilon-greedy"),
-    "boltzmann": _bandit("value_bandits:Boltzmann", "bandit: softmax of the estimates"),
-    "ucb": _bandit("upper_bounds:UCB", "bandit: upper confidence bounds"),
-    "kl_ucb": _bandit("upper_bounds:KLUCB", "bandit: upper bounds by Kullback-Leibler divergence"),
-    "gradient_bandit": _bandit("preferences:GradientBandit", "bandit: gradient on preferences"),
-    "exp3": _bandit("preferences:Exp3", "bandit: exponential weights against an adversary"),
-    "thompson": _bandit("thompson:Thompson", "bandit: Thompson sampling"),
+    "epsilon_greedy": _bandit("tables:EpsilonGreedy", "bandit: epsilon-greedy"),
+    "boltzmann": _bandit("tables:Boltzmann", "bandit: softmax of the estimates"),
+    "ucb": _bandit("rules:UCB", "bandit: upper confidence bounds"),
+    "kl_ucb": _bandit("rules:KLUCB", "bandit: upper bounds by Kullback-Leibler divergence"),
+    "gradient_bandit": _bandit("rules:GradientBandit", "bandit: gradient on preferences"),
+    "exp3": _bandit("rules:Exp3", "bandit: exponential weights against an adversary"),
+    "thompson": _bandit("rules:Thompson", "bandit: Thompson sampling"),
     "linucb": _bandit(
         "linear:LinUCB",
         "contextual bandit: linear upper confidence bounds",

@@ -51,8 +51,8 @@ def finite_horizon_optimum(
     Sutton and Barto, Reinforcement Learning, 2nd edition, chapter 4; Puterman, Markov
     Decision Processes, 1994, section 4.5.
 
-    Arguments and errors are those of `mdp.planning.value_iteration`, and ``horizon``, the time limit
-    in steps, at least 1.
+    Arguments and errors are those of `mdp.planning.value_iteration`, and ``horizon``, the time
+    limit in steps, at least 1.
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, it must be at least 1")

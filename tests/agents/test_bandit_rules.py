@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.bandits.algorithm import Pull
-from rl_yardstick.agents.bandits.upper_bounds import (
+from rl_yardstick.agents.bandits.rules import (
     bernoulli_kl,
     kl_ucb_index,
     kl_upper_bound,

@@ -10,8 +10,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents.compiled.env_states import COMPENSATED_SUM
-from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
 from rl_yardstick.agents.compiled.loop import add_to_return, begin_episode
+from rl_yardstick.agents.compiled.references import handles_of, next_uniform
 from rl_yardstick.agents.compiled.worlds import (
     CAR_STATE,
     CART_POLE_ENV,

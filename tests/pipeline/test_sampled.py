@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from rl_yardstick.agents import load_algorithm
-from rl_yardstick.agents.compiled import greedy_play
+from rl_yardstick.agents.compiled import engine
 from rl_yardstick.commands.terminal import result_lines
 from rl_yardstick.envs.wrappers import DiscretizeObservation
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
@@ -314,7 +314,7 @@ def test_compiled_play_is_the_same_to_the_bit(monkeypatch, algo, env_id, wrapper
     # More than one go, and further episodes that go on from where the generators were left.
     for i, play in enumerate([(5, 1), (23, None), (2, None), (5, 0)]):
         if i == 2:
-            monkeypatch.setattr(greedy_play, "STEPS_AT_ONCE", 7)
+            monkeypatch.setattr(engine, "STEPS_AT_ONCE", 7)
         found, expected = evaluate_compiled(model, copy, *play), evaluate(model, plain, *play)
         assert figures(found) == figures(expected)
         assert (found.returns.dtype, found.lengths.dtype) == (expected.returns.dtype, np.int64)

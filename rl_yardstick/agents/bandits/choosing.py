@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl_yardstick.agents.common.exploration import greedy_action
-from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.references import generator_of
 from rl_yardstick.machine_code.compiling import inlined, kernel
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 

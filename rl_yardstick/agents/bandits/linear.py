@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from rl_yardstick.agents.bandits.algorithm import (
-    ArmPolicy,
-    EpsilonGreedyBandit,
-    Pull,
-    RuleBandit,
-)
+from rl_yardstick.agents.bandits.algorithm import ArmPolicy, EpsilonGreedyBandit, Pull, RuleBandit
 from rl_yardstick.agents.bandits.choosing import (
     PULL,
     Feedback,
@@ -31,12 +26,8 @@ from rl_yardstick.agents.bandits.choosing import (
     row_of_vector,
 )
 from rl_yardstick.agents.common.exploration import choose_action
-from rl_yardstick.agents.common.settings import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    check_vectors,
-)
-from rl_yardstick.agents.compiled.generators import generator_of, handles_of
+from rl_yardstick.agents.common.settings import NOT_NEGATIVE, POSITIVE, check_vectors
+from rl_yardstick.agents.compiled.references import generator_of, handles_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats, Ints
 

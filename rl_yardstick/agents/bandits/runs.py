@@ -17,13 +17,13 @@ from stable_baselines3.common.monitor import Monitor
 
 from rl_yardstick.agents.bandits.choosing import Regressions, ScoreTables
 from rl_yardstick.agents.bandits.linear import LinearBanditAgent
+from rl_yardstick.agents.bandits.rules import Thompson
 from rl_yardstick.agents.bandits.tables import TableBandit
-from rl_yardstick.agents.bandits.thompson import Thompson
 from rl_yardstick.agents.compiled.engine import check_class
 from rl_yardstick.agents.compiled.env_states import COMPENSATED_SUM
-from rl_yardstick.agents.compiled.generators import generator_of, handles_of
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
 from rl_yardstick.agents.compiled.loop import learn_from_last_step, run_block
+from rl_yardstick.agents.compiled.references import generator_of, handles_of
 from rl_yardstick.agents.compiled.worlds import EPISODE, NotCompilable, env_dtype
 from rl_yardstick.agents.registry import load_algorithm
 from rl_yardstick.envs.bandits import BernoulliBandit, GaussianBandit, LinearBandit, SegmentBandit

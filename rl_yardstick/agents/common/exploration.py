@@ -210,12 +210,7 @@ def action_probability(
 
 
 def action_probabilities(
-    strategy: int,
-    values: Floats,
-    rate: float,
-    *,
-    random_ties: bool,
-    masks: Bools | None = None,
+    strategy: int, values: Floats, rate: float, *, random_ties: bool, masks: Bools | None = None
 ) -> Floats:
     """The exploring policy as a matrix of the shape of ``values``, (S, A).
 

@@ -15,10 +15,10 @@ from rl_yardstick.agents.common.schedules import schedule_value
 from rl_yardstick.machine_code.cache import RULE_PREFIX
 from rl_yardstick.machine_code.compiling import (
     INLINED_OPTIONS,
+    IS_INTERPRETED,
     PART_OPTIONS,
     PartCompiler,
     inlined,
-    IS_INTERPRETED,
     kernel,
 )
 from rl_yardstick.mdp.transition_model import Floats

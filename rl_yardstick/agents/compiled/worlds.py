@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from rl_yardstick.agents.compiled.generators import next_uniform
+from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.envs.known_models import (
     model_check,
     observations_of_states,

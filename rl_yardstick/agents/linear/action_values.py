@@ -16,8 +16,8 @@ from rl_yardstick.agents.common.exploration import (
 from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import EPSILONS, FINITE, ExplorationDecay
 from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
-from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm
 from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, choose, look, move_sum, sum_of

@@ -16,15 +16,10 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from rl_yardstick.agents.common.algorithm import Transitions
 from rl_yardstick.agents.common.exploration import first_best
 from rl_yardstick.agents.common.model_files import TablePolicy
-from rl_yardstick.agents.common.settings import (
-    SHARE,
-    TieBreaking,
-    check_space,
-    check_vectors,
-)
+from rl_yardstick.agents.common.settings import SHARE, TieBreaking, check_space, check_vectors
 from rl_yardstick.agents.compiled.engine import EngineChoice
 from rl_yardstick.agents.compiled.env_states import BEFORE, move_on
-from rl_yardstick.agents.compiled.generators import handles_of
+from rl_yardstick.agents.compiled.references import handles_of
 from rl_yardstick.agents.compiled.worlds import env_dtype
 from rl_yardstick.agents.linear.tiles import (
     Bound,

@@ -16,7 +16,7 @@ from rl_yardstick.agents.common.exploration import (
 )
 from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE
 from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
-from rl_yardstick.agents.compiled.generators import next_uniform
+from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm
 from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, look, move_sum

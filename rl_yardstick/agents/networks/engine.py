@@ -1,21 +1,219 @@
-"""Trains an agent of the library on the compiled loop, with the library's callbacks and logs."""
+"""Trains and plays agents of the library on the compiled loop, in the memory of their networks."""
 
 from __future__ import annotations
 
+import ctypes
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from torch import nn
 
 from rl_yardstick.agents.common.callbacks import EpisodeBudget, Horizon, horizon, members
+from rl_yardstick.agents.common.exploration import first_best
 from rl_yardstick.agents.compiled.engine import CompiledEngine
-from rl_yardstick.agents.compiled.env_states import Numbers
-from rl_yardstick.agents.compiled.generators import handles_of
+from rl_yardstick.agents.compiled.env_states import BEFORE, Numbers, look, move_on
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
-from rl_yardstick.agents.compiled.references import Reference, address_of
-from rl_yardstick.agents.networks.torch_bridge import FlatTensors, SharedOptimizer
+from rl_yardstick.agents.compiled.references import Reference, address_of, call, handles_of
+from rl_yardstick.agents.compiled.worlds import NotCompilable
+from rl_yardstick.agents.networks.perceptron import (
+    ADAM,
+    ADAMW,
+    IDENTITY,
+    RELU,
+    RMSPROP,
+    RMSPROP_TENSORFLOW,
+    TANH,
+    Inputs,
+    Layers,
+    Optimizer,
+    Singles,
+    forward,
+    last_outputs,
+    make_inputs,
+    make_layers,
+    make_outputs,
+    n_parameters,
+    outputs_of,
+    weights_of,
+)
+from rl_yardstick.machine_code.compiling import inlined, kernel
+
+_ACTIVATIONS: dict[type[nn.Module], int] = {nn.Identity: IDENTITY, nn.ReLU: RELU, nn.Tanh: TANH}
+
+# The values that settings of optimizers must have if compiled steps do not support them.
+_PLAIN = {"amsgrad": False, "maximize": False, "momentum": 0, "centered": False}
+_OPTIMIZERS = {th.optim.Adam, th.optim.AdamW, th.optim.RMSprop, RMSpropTFLike}
+
+
+@dataclass(frozen=True)
+class Network:
+    """A perceptron of the library: its layers in order, and their shape for compiled code."""
+
+    linears: Sequence[nn.Linear]
+    layers: Layers
+
+    @property
+    def parameters(self) -> list[th.Tensor]:
+        """The weights and biases, in the order of the flat vector."""
+        return [p for linear in self.linears for p in (linear.weight, linear.bias)]
+
+
+def network_of(modules: Iterable[nn.Module], start: int, *, one_hot: bool) -> Network:
+    """The perceptron of these modules: linear layers with one activation function in between.
+
+    Its parameters begin at ``start`` of the flat vector. Raises NotCompilable for other modules.
+    """
+    linears: list[nn.Linear] = []
+    functions: list[int] = []
+    for module in modules:
+        if type(module) is nn.Linear and module.bias is not None:
+            if len(linears) != len(functions):
+                raise NotCompilable("a network has linear layers without a function in between")
+            linears.append(module)
+        elif len(functions) == len(linears) - 1 and type(module) in _ACTIVATIONS:
+            functions.append(_ACTIVATIONS[type(module)])
+        else:
+            raise NotCompilable(f"a network has a layer of {type(module).__name__}")
+    if len(set(functions)) > 1:
+        raise NotCompilable("a network has several activation functions")
+    if len(functions) != len(linears) - 1:
+        raise NotCompilable("a network ends with an activation function")
+    sizes = [linears[0].in_features, *(linear.out_features for linear in linears)]
+    activation = functions[0] if functions else IDENTITY
+    return Network(linears, make_layers(sizes, start, activation, one_hot=one_hot))
+
+
+def check_optimizer(optimizer: th.optim.Optimizer) -> None:
+    """Raise `NotCompilable` if compiled steps would differ from those of the optimizer."""
+    if type(optimizer) not in _OPTIMIZERS:
+        raise NotCompilable(f"its optimizer is {type(optimizer).__name__}, not Adam or RMSprop")
+    if len(optimizer.param_groups) != 1:
+        raise NotCompilable("its optimizer has several groups of parameters")
+    group = optimizer.param_groups[0]
+    for name, plain in _PLAIN.items():
+        if group.get(name, plain) != plain:
+            raise NotCompilable(f"its optimizer has {name} {group[name]}")
+    if not all(parameter.requires_grad for parameter in group["params"]):
+        raise NotCompilable("some of its parameters are frozen")
+    if any(parameter.dtype is not th.float32 for parameter in group["params"]):
+        raise NotCompilable("its parameters are not in single precision")
+
+
+# While an agent trains, its tensors are views of flat vectors, so callbacks can read and change
+# the parameters at any time. Afterwards the tensors have their own memory again, in PyTorch's
+# layout.
+
+
+class FlatTensors:
+    """A flat vector of networks' parameters, with a view of it for each parameter."""
+
+    def __init__(self, networks: Sequence[Network]) -> None:
+        self.vector: Singles = np.zeros(sum(n_parameters(n.layers) for n in networks), np.float32)
+        self.places: list[tuple[th.Tensor, th.Tensor]] = []
+        begin = 0
+        for parameter in (p for network in networks for p in network.parameters):
+            end = begin + parameter.numel()
+            # Compiled code stores weights as (inputs, outputs).
+            turned = self.vector[begin:end].reshape(tuple(parameter.shape)[::-1])
+            self.places.append((parameter, th.from_numpy(turned.T)))
+            begin = end
+
+    def take_over(self) -> None:
+        """Move parameters into the vector, e.g. after a callback has replaced them."""
+        for parameter, place in self.places:
+            if parameter.data_ptr() != place.data_ptr():
+                place.copy_(parameter.data)
+                parameter.data = place
+
+    def give_back(self) -> None:
+        """Give the parameters their own memory again."""
+        for parameter, _ in self.places:
+            parameter.data = parameter.data.clone(memory_format=th.contiguous_format)
+
+
+class SharedOptimizer:
+    """The state of a policy's optimizer for the networks' parameters, in flat vectors."""
+
+    def __init__(self, policy: Any, networks: Sequence[Network]) -> None:
+        self.parameters = [p for network in networks for p in network.parameters]
+        self.optimizer = policy.optimizer
+        known: Any = self.optimizer.state
+        kind, names = _kind(self.optimizer)
+        means = {name: FlatTensors(networks) for name in names}
+        n_steps = np.zeros(1, np.float32)
+        if self.parameters[0] in known:
+            n_steps[0] = float(known[self.parameters[0]]["step"])
+        # As in the library, the mean of squares of RMSpropTFLike begins with ones.
+        begins = th.tensor(1.0 if kind == RMSPROP_TENSORFLOW else 0.0)
+        for name, tensors in means.items():
+            for parameter, place in tensors.places:
+                place.copy_(known[parameter].get(name, begins))
+                known[parameter][name] = place
+        for parameter in self.parameters:
+            known[parameter]["step"] = th.from_numpy(n_steps)[0]
+        vectors = [tensors.vector for tensors in means.values()]
+        group = self.optimizer.param_groups[0]
+        momentum, smoothing = group.get("betas", (0.0, group.get("alpha")))
+        self.compiled = Optimizer(
+            kind,
+            float(momentum),
+            float(smoothing),
+            float(group["eps"]),
+            float(group["weight_decay"]),
+            vectors[0],
+            vectors[-1],
+            n_steps,
+        )
+
+    def give_back(self) -> None:
+        """Give its state its own memory again; without a step, it has no state."""
+        known: Any = self.optimizer.state
+        kind, _ = _kind(self.optimizer)
+        remembered = [parameter for parameter in self.parameters if parameter in known]
+        for parameter in remembered:
+            known[parameter] = _own_memory(known[parameter], kind)
+        if not any(known[parameter]["step"] for parameter in remembered):
+            known.clear()
+
+
+def in_rows(state: Any) -> Any:
+    """A copy of a ``state_dict`` with contiguous tensors, as in the library."""
+    if isinstance(state, dict):
+        copied = copy(state)
+        copied.update({name: in_rows(value) for name, value in state.items()})
+        return copied
+    return state.contiguous() if isinstance(state, th.Tensor) else state
+
+
+def _own_memory(state: dict[str, Any], kind: int) -> dict[str, Any]:
+    """A copy of an optimizer's state of a parameter, in PyTorch's memory layout."""
+    copied = {
+        name: value.clone(memory_format=th.contiguous_format)
+        if isinstance(value, th.Tensor)
+        else value
+        for name, value in state.items()
+    }
+    if kind == RMSPROP_TENSORFLOW:
+        copied["step"] = int(copied["step"])
+    return copied
+
+
+def _kind(optimizer: th.optim.Optimizer) -> tuple[int, tuple[str, ...]]:
+    """The kind of the optimizer here, and PyTorch's names of its running means."""
+    if isinstance(optimizer, th.optim.Adam):
+        decoupled = optimizer.param_groups[0]["decoupled_weight_decay"]
+        return ADAMW if decoupled else ADAM, ("exp_avg", "exp_avg_sq")
+    if isinstance(optimizer, RMSpropTFLike):
+        return RMSPROP_TENSORFLOW, ("square_avg",)
+    return RMSPROP, ("square_avg",)
+
 
 # A placeholder of an address, until there is a reference to the learner.
 NOWHERE = np.uintp(0)
@@ -185,3 +383,106 @@ class NetworkEngine(CompiledEngine):
         self.training.read()
         self.states.read()
         self.states.take_observations(agent._last_obs)
+
+
+# The best output must be ahead by this share of the sum of magnitudes (ten times the rounding error
+# with 64 to 400 units), and by at least this much, because PyTorch compares probabilities.
+CLEARLY, AT_LEAST = 4e-6, 1e-6
+
+_ASKED = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_double)
+
+
+class GreedyNetwork(NamedTuple):
+    """A network whose largest output is the best action, by reference."""
+
+    layers: Layers  # its shape
+    flat: Singles  # its parameters
+    single: Inputs  # buffer for one observation
+    single_outputs: Singles  # buffer for its outputs
+    ask: np.uintp  # the address of the function that chooses if two actions are close
+
+
+@kernel
+def choose_surely(network: Any, _: float, __: float) -> int:
+    """The best action for the observation in ``network.single``."""
+    forward(network.layers, network.flat, network.single, 1, network.single_outputs)
+    outputs = last_outputs(network.layers, network.single_outputs, 1)[0]
+    best, unsure = first_best(outputs), _unsure(network, outputs)
+    for k in range(len(outputs)):
+        # With nan the comparison is False, too.
+        if k != best and not outputs[best] - outputs[k] > unsure:
+            return call(network.ask, network, 0.0, 0.0)
+    return best
+
+
+@inlined
+def _unsure(network: Any, outputs: Singles) -> float:
+    """The largest difference of two outputs at which rounding may decide."""
+    layers, last, most = network.layers, len(network.layers.sizes) - 2, 0.0
+    weights = weights_of(layers, network.flat, last)
+    for k in range(len(outputs)):
+        added = abs(outputs[k])
+        if last > 0:
+            below = outputs_of(layers, network.single_outputs, last - 1, 1)[0]
+            for j in range(len(below)):
+                added += abs(below[j] * weights[j, k])
+        most = max(most, added)
+    return max(CLEARLY * most, AT_LEAST)
+
+
+class AskingNetwork(Reference):
+    """A reference to a `GreedyNetwork`, which calls ``predict`` if two actions are close."""
+
+    def __init__(self, layers: Layers, flat: Singles, predict: Callable[[Inputs], int]) -> None:
+        self.predict = predict
+        # Exceptions of `predict`, which cannot pass through compiled code.
+        self.errors: list[BaseException] = []
+        # Kept here, because compiled code does not keep it alive.
+        self._called = _ASKED(self._answer)
+        ask = np.uintp(ctypes.cast(self._called, ctypes.c_void_p).value or 0)
+        inputs, outputs = make_inputs(layers, 1), make_outputs(layers, 1)
+        super().__init__(GreedyNetwork(layers, flat, inputs, outputs, ask))
+
+    def _answer(self, _: int | None, __: float, ___: float) -> int:
+        if self.errors:
+            return 0
+        try:
+            return self.predict(self.held.single)
+        except BaseException as error:  # noqa: BLE001  # raised once compiled code has returned
+            self.errors.append(error)
+            return 0
+
+
+class NetworkPlayer(NamedTuple):
+    """The agent for the compiled loop."""
+
+    network: Any  # an `AskingNetwork`
+    seen: Any  # how observations are read, of `agents.compiled.env_states`
+    choose: np.uintp  # the address of `choose_surely`
+
+    @inlined
+    def act(self, env: Any, progress: Any) -> None:
+        """Take the best action."""
+        look(self.seen, env, BEFORE, self.network.single, self.network.layers.one_hot)
+        env.action = call(self.choose, self.network, 0.0, 0.0)
+
+    @inlined
+    def learn_from_step(self, envs: Any, progress: Any) -> None:
+        """Learn nothing; move on to the next observations."""
+        for i in range(len(envs)):
+            move_on(self.seen, envs[i])
+
+    def check(self) -> None:
+        """Raise the exception of the library's `predict`, if there was one."""
+        if errors := self.network.errors:
+            raise errors.pop()
+
+
+def network_player(network: Network, seen: Any, predict: Callable[[Inputs], int]) -> NetworkPlayer:
+    """A player with a copy of a network's present parameters."""
+    tensors = FlatTensors([network])
+    with th.no_grad():
+        for parameter, place in tensors.places:
+            place.copy_(parameter)
+    asking = AskingNetwork(network.layers, tensors.vector, predict)
+    return NetworkPlayer(asking, seen, address_of(choose_surely, asking))

@@ -34,10 +34,15 @@ from rl_yardstick.agents.common.settings import full_signature
 from rl_yardstick.agents.compiled.env_states import Numbers, OwnVectors, observed_world
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
 from rl_yardstick.agents.compiled.worlds import NotCompilable
-from rl_yardstick.agents.networks.engine import NetworkEngine
+from rl_yardstick.agents.networks.engine import (
+    Network,
+    NetworkEngine,
+    NetworkPlayer,
+    check_optimizer,
+    in_rows,
+    network_player,
+)
 from rl_yardstick.agents.networks.perceptron import Inputs, one_thread
-from rl_yardstick.agents.networks.playing import NetworkPlayer, network_player
-from rl_yardstick.agents.networks.torch_bridge import Network, check_optimizer, in_rows
 from rl_yardstick.machine_code.cache import folder
 
 # Conditions for compiled trainings of the library's agents.

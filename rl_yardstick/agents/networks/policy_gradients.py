@@ -28,11 +28,22 @@ from rl_yardstick.agents.compiled.env_states import (
     observe,
     show,
 )
-from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
-from rl_yardstick.agents.compiled.references import Reference, address_of, call
+from rl_yardstick.agents.compiled.references import (
+    Reference,
+    address_of,
+    call,
+    handles_of,
+    next_uniform,
+)
 from rl_yardstick.agents.compiled.worlds import SCHEDULE, NotCompilable
-from rl_yardstick.agents.networks.engine import NOWHERE, NetworkTraining, record_of
+from rl_yardstick.agents.networks.engine import (
+    NOWHERE,
+    Network,
+    NetworkTraining,
+    network_of,
+    record_of,
+)
 from rl_yardstick.agents.networks.engine_setting import CompiledNetworks, Work, work_of
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
@@ -47,7 +58,6 @@ from rl_yardstick.agents.networks.perceptron import (
     make_outputs,
     n_parameters,
 )
-from rl_yardstick.agents.networks.torch_bridge import Network, network_of
 from rl_yardstick.machine_code.compiling import called, inlined, kernel
 from rl_yardstick.mdp.transition_model import Bools, Ints
 
@@ -820,10 +830,7 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         """The bodies and heads of the networks of action probabilities and of values."""
         policy: Any = self.policy
         extractor = policy.mlp_extractor
-        return [
-            [extractor.policy_net, policy.action_net],
-            [extractor.value_net, policy.value_net],
-        ]
+        return [[extractor.policy_net, policy.action_net], [extractor.value_net, policy.value_net]]
 
     def shared_networks(self, seen: Any) -> tuple[list[Network], list[Network]]:
         one_hot = isinstance(seen, Numbers)

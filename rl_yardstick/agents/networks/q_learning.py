@@ -24,10 +24,21 @@ from rl_yardstick.agents.compiled.env_states import (
     observe,
     show,
 )
-from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
-from rl_yardstick.agents.compiled.references import Reference, address_of, call
+from rl_yardstick.agents.compiled.references import (
+    Reference,
+    address_of,
+    call,
+    handles_of,
+    next_uniform,
+)
 from rl_yardstick.agents.compiled.worlds import NotCompilable
-from rl_yardstick.agents.networks.engine import NOWHERE, NetworkTraining, record_of
+from rl_yardstick.agents.networks.engine import (
+    NOWHERE,
+    Network,
+    NetworkTraining,
+    network_of,
+    record_of,
+)
 from rl_yardstick.agents.networks.engine_setting import (
     STEPS_OF_EPISODE,
     CompiledNetworks,
@@ -46,7 +57,6 @@ from rl_yardstick.agents.networks.perceptron import (
     make_inputs,
     make_outputs,
 )
-from rl_yardstick.agents.networks.torch_bridge import Network, network_of
 from rl_yardstick.machine_code.compiling import called, inlined, kernel
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
@@ -177,13 +187,7 @@ def learn_from_minibatch(learner: Any, learning_rate: float, _: float) -> int:
     forward(layers, learner.flat, batch.states, n, learner.outputs)
     learner.place[0].losses += _errors(learner, n, rules.largest_error)
     backward(
-        layers,
-        learner.flat,
-        batch.states,
-        n,
-        learner.outputs,
-        learner.errors,
-        learner.gradient,
+        layers, learner.flat, batch.states, n, learner.outputs, learner.errors, learner.gradient
     )
     descend(learner.optimizer, learner.flat, learner.gradient, learning_rate, rules.max_grad_norm)
     return n

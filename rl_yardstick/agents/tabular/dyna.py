@@ -11,11 +11,10 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
-from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
-from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
+from rl_yardstick.agents.compiled.references import next_uniform
+from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.agents.tabular.one_step import QLearning
-from rl_yardstick.agents.tabular.policy import QTablePolicy
 from rl_yardstick.agents.tabular.updates import TabularAgent, action_at, best_value, room_at, update
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints

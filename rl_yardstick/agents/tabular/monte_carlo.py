@@ -12,13 +12,13 @@ from rl_yardstick.agents.common.exploration import greedy_action, highest_value
 from rl_yardstick.agents.common.settings import whole
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.tabular.algorithm import QTablePolicy
 from rl_yardstick.agents.tabular.n_step import (
     NOTHING_LEARNT,
     EpisodicAlgorithm,
     place_of,
     probability_of,
 )
-from rl_yardstick.agents.tabular.policy import QTablePolicy
 from rl_yardstick.agents.tabular.updates import (
     TabularAgent,
     act_on_values,

@@ -11,8 +11,8 @@ from rl_yardstick.agents.common.exploration import (
     random_action,
 )
 from rl_yardstick.agents.common.settings import step_size
-from rl_yardstick.agents.compiled.generators import generator_of, next_uniform
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.references import generator_of, next_uniform
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints

@@ -385,9 +385,8 @@ def evaluate_compiled(
     model: BaseAlgorithm, copy: CompiledCopy, n_episodes: int, seed: int | None
 ) -> Evaluation:
     """Like `evaluate`, in compiled code; the library's network decides near ties."""
-    from rl_yardstick.agents.compiled.env_states import EnvStates
-    from rl_yardstick.agents.compiled.greedy_play import play_episodes
-    from rl_yardstick.agents.compiled.records import DECIMALS
+    from rl_yardstick.agents.compiled.engine import play_episodes
+    from rl_yardstick.agents.compiled.env_states import DECIMALS, EnvStates
     from rl_yardstick.agents.networks.perceptron import one_thread
 
     env, n_envs = copy.env, copy.env.num_envs
