@@ -21,8 +21,8 @@ from rl_yardstick.agents.common.exploration import (
     make_probabilities,
 )
 from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE
-from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.references import generator_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats
 
