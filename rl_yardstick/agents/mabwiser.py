@@ -13,13 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from rl_yardstick.agents.bandits.algorithm import BINARY, BanditAlgorithm, Pull
 from rl_yardstick.agents.bandits.linear import features
 from rl_yardstick.agents.common.model_files import TablePolicy
-from rl_yardstick.agents.common.settings import (
-    NOT_NEGATIVE,
-    SHARE,
-    TieBreaking,
-    check_space,
-    check_vectors,
-)
+from rl_yardstick.agents.common.settings import NOT_NEGATIVE, SHARE, check_space, check_vectors
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
 
@@ -60,60 +54,44 @@ class MABWiserPolicy(TablePolicy):
         super().__init__(*args, **kwargs)
         self.kind, self.settings = kind, settings or {}
         self.statistics = KINDS[kind].statistics
-        learning_policy = getattr(LearningPolicy, kind)(**self.settings)
-        n_arms = int(self.action_space.n)  # type: ignore[attr-defined]
-        self.mab: Any = MAB(list(range(n_arms)), learning_policy)
+        arms = range(int(self.action_space.n))  # type: ignore[attr-defined]
+        self.mab: Any = MAB(list(arms), getattr(LearningPolicy, kind)(**self.settings))
         self.fitted = False
 
     def _sizes(self) -> dict[str, Any]:
         return {"kind": self.kind, "settings": self.settings}
 
     @property
-    def models(self) -> list[Any]:
-        """The regression of each arm; none for policies that ignore the context."""
-        inside = self.mab._imp
-        return [] if self.statistics else [inside.arm_to_model[arm] for arm in self.mab.arms]
-
-    @property
     def parts(self) -> Floats:
         """The state: a row of numbers for each arm, shape (arms, ...)."""
-        if not self.statistics:
-            rows = [[m.A.ravel(), m.A_inv.ravel(), m.Xty, m.beta] for m in self.models]
-            return np.stack([np.concatenate(row) for row in rows])
-        columns = [getattr(self.mab._imp, name) for name in self.statistics]
-        return np.array([[column[arm] for column in columns] for arm in self.mab.arms], dtype=float)
-
-    def choose(self, context: Floats, rng: np.random.Generator) -> int:
-        """The library's choice of an arm in ``context``, of shape (features,)."""
-        self.mab._rng.rng = rng
-        return int(self.mab.predict(*self._told(context)))
+        inside, arms = self.mab._imp, self.mab.arms
+        if self.statistics:
+            rows = [[getattr(inside, name)[arm] for name in self.statistics] for arm in arms]
+            return np.array(rows, dtype=np.float64)
+        models = [inside.arm_to_model[arm] for arm in arms]
+        return np.stack([np.concatenate([m.A, m.A_inv, m.Xty, m.beta], None) for m in models])
 
     def learn(self, arm: int, reward: float, context: Floats) -> None:
-        """Let the library learn from one reward."""
+        """Let the library learn from one reward in ``context``, of shape (features,)."""
         learn = self.mab.partial_fit if self.fitted else self.mab.fit
-        learn([arm], [reward], *self._told(context))
+        learn([arm], [reward], *(() if self.statistics else (context[None],)))
         self.fitted = True
-
-    def _told(self, context: Floats) -> tuple[Floats, ...]:
-        return () if self.statistics else (context[None],)
 
     def judged(self, contexts: Floats) -> Floats:
         """The estimated mean reward of each arm, shape (n, arms)."""
         if not self.fitted:
             return np.zeros((len(contexts), len(self.mab.arms)))
         if not self.statistics:
-            return np.stack([contexts @ model.beta for model in self.models], axis=1)
+            models = self.mab._imp.arm_to_model
+            return np.stack([contexts @ models[arm].beta for arm in self.mab.arms], axis=1)
         won, seen = self.parts[:, 0], self.parts[:, 1]
         if self.kind == "ThompsonSampling":
             seen = won + seen
         means = np.divide(won, seen, out=np.full(len(won), -np.inf), where=seen > 0)
         return np.tile(means, (len(contexts), 1))
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         """The first of the best arms, shape (n,), for observations of shape (n,) or (n, d)."""
-        assert isinstance(observation, th.Tensor)
         contexts = features(self.observation_space, observation.numpy())
         return th.from_numpy(self.judged(contexts).argmax(axis=1))
 
@@ -128,47 +106,39 @@ class MABWiserPolicy(TablePolicy):
         if len(state) != len(self.mab.arms):
             raise ValueError(f"holds {len(state)} arms, not {len(self.mab.arms)}")
         shown = np.zeros((1, *(self.observation_space.shape or ())))
-        context, rows = features(self.observation_space, shown)[0], state.numpy()
+        context, inside = features(self.observation_space, shown)[0], self.mab._imp
         self.learn(0, 0.0, 0.0 * context)  # makes the library's objects
         n = len(context)
-        for model, row in zip(self.models, rows, strict=False):
-            a, a_inv, model.Xty, model.beta = np.split(row.copy(), np.cumsum([n * n, n * n, n]))
-            model.A, model.A_inv = a.reshape(n, n), a_inv.reshape(n, n)
+        for arm, row in enumerate(state.numpy()):
+            for name, value in zip(self.statistics, row.tolist(), strict=bool(self.statistics)):
+                getattr(inside, name)[arm] = value
+            if not self.statistics:
+                model, ends = inside.arm_to_model[arm], np.cumsum([n * n, n * n, n])
+                a, a_inv, model.Xty, model.beta = np.split(row.copy(), ends)
+                model.A, model.A_inv = a.reshape(n, n), a_inv.reshape(n, n)
         if self.statistics:
-            for name, column in zip(self.statistics, rows.T.tolist(), strict=True):
-                getattr(self.mab._imp, name).update(enumerate(column))
-            self.mab._imp.total_count = sum(column[1] for column in rows.tolist())
+            inside.total_count = float(state[:, 1].sum())
 
 
 class MABWiserAgent(BanditAlgorithm):
-    """The base of the agents that learn and choose by MABWiser.
-
-    Args:
-        policy: ``"MABWiserPolicy"``.
-        env: environment with `Discrete` actions, the arms, or its id.
-        tie_breaking: ``"first"``, as in the library.
-        kwargs: as in `BanditAlgorithm`.
-    """
+    """The base of the agents that learn and choose by MABWiser, which takes the first of ties."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MABWiserPolicy": MABWiserPolicy}
     policy: MABWiserPolicy
     kind: ClassVar[str]  # one of `KINDS`
 
-    hidden_arguments = ("learning_rate", "mask_actions")
+    hidden_arguments = ("learning_rate", "mask_actions", "tie_breaking")
 
     def __init__(
         self,
         policy: str | type[BasePolicy] = "MABWiserPolicy",
         env: GymEnv | str | None = None,
-        tie_breaking: TieBreaking = "first",
         **kwargs: Any,
     ) -> None:
-        super().__init__(policy, env, tie_breaking=tie_breaking, **kwargs)
+        super().__init__(policy, env, tie_breaking="first", **kwargs)
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        if self.tie_breaking != "first":
-            raise ValueError("tie_breaking must be first: MABWiser takes the first of equal arms")
         if KINDS[self.kind].statistics:
             check_space(self, "observations", self.observation_space)
         else:
@@ -188,8 +158,10 @@ class MABWiserAgent(BanditAlgorithm):
     def _choose(  # type: ignore[override]  # the library knows no masks
         self, contexts: Floats, rng: np.random.Generator
     ) -> tuple[Ints, Floats]:
-        first = self._first_pull()
-        arms = [self.policy.choose(c, rng) if first is None else first for c in contexts]
+        first, mab = self._first_pull(), self.policy.mab
+        mab._rng.rng = rng
+        told = [() if self.policy.statistics else (context[None],) for context in contexts]
+        arms = [int(mab.predict(*each)) if first is None else first for each in told]
         return np.array(arms, dtype=np.int64), np.ones(len(arms))
 
     def _learn(self, pull: Pull) -> None:
@@ -197,13 +169,7 @@ class MABWiserAgent(BanditAlgorithm):
 
 
 class MABWiserEpsilonGreedy(MABWiserAgent):
-    """MABWiser's epsilon-greedy on sample averages, the same for all contexts.
-
-    Args:
-        args: as in `MABWiserAgent`.
-        exploration_initial_eps: epsilon, which is constant.
-        kwargs: as in `MABWiserAgent`.
-    """
+    """MABWiser's epsilon-greedy on sample averages, with a constant epsilon; ignores contexts."""
 
     kind = "EpsilonGreedy"
     ranges = {"exploration_initial_eps": SHARE}  # noqa: RUF012
@@ -214,13 +180,7 @@ class MABWiserEpsilonGreedy(MABWiserAgent):
 
 
 class MABWiserUCB1(MABWiserAgent):
-    """MABWiser's UCB1, the same for all contexts.
-
-    Args:
-        args: as in `MABWiserAgent`.
-        c: degree of exploration, the library's alpha.
-        kwargs: as in `MABWiserAgent`.
-    """
+    """MABWiser's UCB1, with a degree of exploration ``c``, its alpha; ignores contexts."""
 
     kind = "UCB1"
     ranges = {"c": NOT_NEGATIVE}  # noqa: RUF012
@@ -236,22 +196,16 @@ class MABWiserUCB1(MABWiserAgent):
 
 
 class MABWiserThompson(MABWiserAgent):
-    """MABWiser's Thompson sampling with Beta(1, 1) priors, the same for all contexts.
-
-    Takes the arguments of `MABWiserAgent`.
-    """
+    """MABWiser's Thompson sampling with Beta(1, 1) priors; ignores contexts."""
 
     kind = "ThompsonSampling"
     rewards_known = BINARY  # other rewards would silently make its Beta distributions wrong
 
 
 class MABWiserLinUCB(MABWiserAgent):
-    """MABWiser's LinUCB; contexts that are numbers become one-hot, and the ridge is 1.
+    """MABWiser's LinUCB, with ``alpha`` standard deviations and a ridge of 1.
 
-    Args:
-        args: as in `MABWiserAgent`.
-        alpha: how many standard deviations the bound lies above the predicted reward.
-        kwargs: as in `MABWiserAgent`.
+    Contexts that are numbers become one-hot.
     """
 
     kind = "LinUCB"

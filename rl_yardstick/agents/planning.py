@@ -95,7 +95,6 @@ class PlanningAgent(OnlineAlgorithm):
         gamma: discount factor of the planning; by default 1 for the optimum under the time
             limit, and 0.99 for the others.
         mask_actions: plan with only those actions that the environment allows in each state.
-        kwargs: as in `OnlineAlgorithm`.
 
     Raises:
         ValueError: if ``gamma`` is outside [0, 1]; by `learn`, if the model is not known, or

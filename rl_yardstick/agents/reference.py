@@ -40,7 +40,6 @@ class ReferenceAgent(OnlineAlgorithm):
     Args:
         policy: name of the policy.
         env: environment, or its id.
-        kwargs: as in `OnlineAlgorithm`.
     """
 
     hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")

@@ -73,7 +73,6 @@ REFUSED = {
     "linucb": [
         (MATRICES, r"observations of shape \(d,\) in a Box space or in a Discrete space"),
     ],
-    "mabwiser_ucb1": [({"tie_breaking": "random"}, "tie_breaking must be first: MABWiser")],
     "ppo": [({"engine": "fast", "policy": "MlpPolicy"}, "engine must be one of")],
 }  # fmt: skip
 CASES = [(name, *case) for name, cases in REFUSED.items() for case in cases]
@@ -99,7 +98,7 @@ UNDECLARED = {
     "qlearning": ["gama"],
     "qlearning_ucb": ["learning_rate", "exploration", "initial_q"],
     "lin_thompson": ["ignore_context", "learning_rate"],
-    "mabwiser_ucb1": ["mask_actions"],
+    "mabwiser_ucb1": ["mask_actions", "tie_breaking"],
 }
 
 

@@ -20,7 +20,6 @@ from rl_yardstick.agents.bandits.choosing import (
     allowed_room,
     choose_arms,
     learn_from_feedback,
-    no_probability,
 )
 from rl_yardstick.agents.common.algorithm import Transitions
 from rl_yardstick.agents.common.exploration import EPSILON_GREEDY
@@ -110,7 +109,6 @@ class BanditAlgorithm(LearningAlgorithm):
         mask_actions: choose among the arms that the environment allows at each pull, and learn as
             if there were no others. The environment's method `action_masks()` may depend on more
             than the context.
-        kwargs: as in `LearningAlgorithm`.
 
     Raises:
         ValueError: if an argument is outside its range, or a space or a reward does not fit; with
@@ -311,7 +309,6 @@ class RuleBandit(BanditAlgorithm):
 
     act = act_in_context
     learn_from_step = learn_from_feedback
-    choice_probability = no_probability
 
     @abstractmethod
     def _rows(self, agent: Any, contexts: Any) -> tuple[Ints, int]:
@@ -337,12 +334,10 @@ class EpsilonGreedyBandit(RuleBandit):
     """Pulls a random arm with probability epsilon.
 
     Args:
-        args: as in `BanditAlgorithm`.
         exploration_initial_eps: epsilon at the start.
         exploration_final_eps: epsilon at the end of ``exploration_fraction``.
         exploration_fraction: share of training over which epsilon falls.
         exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
-        kwargs: as in `BanditAlgorithm`.
     """
 
     strategy = EPSILON_GREEDY

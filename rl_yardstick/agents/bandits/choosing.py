@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl_yardstick.agents.common.exploration import greedy_action
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import generator_of
 from rl_yardstick.machine_code.compiling import inlined, kernel
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
@@ -31,34 +31,14 @@ PULL = np.dtype(
 )
 
 
-@by_type
-def masked_count(tables: Any) -> int:
-    """Number of rewards of masked arms in the context, which are not in the tables."""
-    raise CompiledOnlyError
-
-
-@by_type
-def masked_sum(tables: Any) -> float:
-    """Sum of the rewards of masked arms in the context, which are not in the tables."""
-    raise CompiledOnlyError
-
-
 class ScoreTables(NamedTuple):
     """The knowledge of an agent; each array of shape (contexts, arms)."""
 
     scores: Floats  # values, posterior means, preferences or log-weights of the arms
     sums: Floats  # sum of the rewards
     counts: Ints  # number of the rewards
-
-    @inlined
-    def masked_count(self) -> int:
-        """All arms are in the tables."""
-        return 0
-
-    @inlined
-    def masked_sum(self) -> float:
-        """All arms are in the tables."""
-        return 0.0
+    other_count: int = 0  # number of the rewards of masked arms, which are not in the tables
+    other_sum: float = 0.0  # their sum
 
 
 class Feedback(NamedTuple):
@@ -72,7 +52,7 @@ class ScoreAgent(NamedTuple):
     """An agent for compiled functions."""
 
     settings: Any  # a record of its class's type
-    tables: Any  # its knowledge, `ScoreTables` or `AllowedTables`
+    tables: ScoreTables  # its knowledge
     feedback: Feedback  # pulls that wait for their feedback
     arms: Floats  # scratch: a number for each arm, shape (arms,)
     draws: Floats  # scratch: the random numbers of a choice, shape (2,)
@@ -91,10 +71,10 @@ def choose_arm(agent: Any, row: int, progress: Any) -> int:
     raise CompiledOnlyError
 
 
-@by_type
+@by_type_or_this
 def choice_probability(agent: Any, row: int, arm: int) -> float:
-    """The probability of choosing ``arm``."""
-    raise CompiledOnlyError
+    """The probability of choosing ``arm``, or 1 if the update does not need it."""
+    return 1.0
 
 
 @by_type
@@ -110,31 +90,20 @@ def choose_allowed(
     raise CompiledOnlyError
 
 
-@by_type
+@by_type_or_this
 def learn_from_pull(agent: ScoreAgent, pull: Any, progress: Any) -> None:
     """Learn from a record of type `PULL`, after its reward has been added to the tables."""
 
 
-@by_type
+@by_type_or_this
 def before_counting(agent: ScoreAgent, pull: Any, progress: Any) -> None:
     """The part of learning that comes before the reward is added to the tables."""
 
 
 @inlined
-def no_probability(agent: ScoreAgent, row: int, arm: int) -> float:
-    """The update does not need the probability."""
-    return 1.0
-
-
-@inlined
-def nothing_before(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """All of the update comes after the reward is added to the tables."""
-
-
-@inlined
 def total_count(tables: Any, row: int) -> int:
     """Number of rewards seen in a context, including those of masked arms."""
-    total = masked_count(tables)
+    total = tables.other_count
     for arm in range(tables.counts.shape[1]):
         total += tables.counts[row, arm]
     return total
@@ -143,7 +112,7 @@ def total_count(tables: Any, row: int) -> int:
 @inlined
 def mean_reward(tables: Any, row: int) -> float:
     """Average of all rewards seen in a context; there must be at least one."""
-    total = masked_sum(tables)
+    total = tables.other_sum
     for arm in range(tables.sums.shape[1]):
         total += tables.sums[row, arm]
     return total / total_count(tables, row)
@@ -217,26 +186,6 @@ def choose_arms(
 # for bit. Only the interpreted loop uses this.
 
 
-class AllowedTables(NamedTuple):
-    """An agent's knowledge of the allowed arms in one context; arrays of shape (1, n)."""
-
-    scores: Floats
-    sums: Floats
-    counts: Ints
-    other_count: int  # number of the rewards of the other arms
-    other_sum: float  # their sum
-
-    @inlined
-    def masked_count(self) -> int:
-        """Number of the rewards of the masked arms."""
-        return self.other_count
-
-    @inlined
-    def masked_sum(self) -> float:
-        """Sum of the rewards of the masked arms."""
-        return self.other_sum
-
-
 class AllowedRoom(NamedTuple):
     """Buffers for the smaller bandit."""
 
@@ -255,7 +204,7 @@ def allowed_room(n_arms: int) -> AllowedRoom:
 
 
 @inlined
-def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom) -> AllowedTables:
+def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom) -> ScoreTables:
     """A copy of the knowledge of the arms of ``mask`` in the context ``row``."""
     n, other_count, other_sum = 0, 0, 0.0
     for arm in range(len(mask)):
@@ -269,7 +218,7 @@ def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom
             other_count += tables.counts[row, arm]
             other_sum += tables.sums[row, arm]
     scores, sums, counts = room.scores[:, :n], room.sums[:, :n], room.counts[:, :n]
-    return AllowedTables(scores, sums, counts, other_count, other_sum)
+    return ScoreTables(scores, sums, counts, other_count, other_sum)
 
 
 @inlined
@@ -337,21 +286,15 @@ class LinearAgent(NamedTuple):
     rng: Any  # a handle of its generator
 
 
-@by_type
+@by_type_or_this
 def bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
     """The bonus added to the predicted reward before the best arm is chosen."""
-    raise CompiledOnlyError
+    return 0.0
 
 
-@by_type
+@by_type_or_this
 def pick(agent: LinearAgent, progress: Any) -> int:
-    """An arm by the scores in ``agent.arms`` and the first draw in ``agent.draws``."""
-    raise CompiledOnlyError
-
-
-@inlined
-def best_arm(agent: LinearAgent, progress: Any) -> int:
-    """An arm of the highest score; the draw breaks ties."""
+    """An arm by the scores in ``agent.arms``: the best; the first draw breaks ties."""
     return greedy_action(agent.arms, agent.draws[0] * agent.settings.tie_scale)
 
 

@@ -17,7 +17,6 @@ from rl_yardstick.agents.bandits.choosing import (
     Feedback,
     LinearAgent,
     Regressions,
-    best_arm,
     choose_by_allowed_models,
     choose_by_model,
     deviation,
@@ -85,12 +84,6 @@ def features(space: spaces.Space[Any], observations: NDArray[Any]) -> Floats:
 
 
 @inlined
-def no_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
-    """Arms are judged by their predicted rewards."""
-    return 0.0
-
-
-@inlined
 def confidence_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
     """``alpha`` standard deviations of the prediction."""
     return float(agent.settings.alpha * deviation(agent, arm, context))
@@ -123,7 +116,6 @@ class LinearBanditAgent(RuleBandit):
         policy: ``"LinearBanditPolicy"``.
         env: environment with `Box` observations of shape (d,) or `Discrete` ones, or its id.
         ridge: regularisation: the diagonal of each regression matrix at the start, above 0.
-        kwargs: as in `BanditAlgorithm`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -136,7 +128,6 @@ class LinearBanditAgent(RuleBandit):
     context_row = row_of_vector
     learn_from_reward = learn_by_model
     choose_allowed = choose_by_allowed_models
-    pick = best_arm
     hidden_arguments: ClassVar[tuple[str, ...]] = ("learning_rate",)
     ranges = {"ridge": POSITIVE}  # noqa: RUF012
 
@@ -199,9 +190,7 @@ class LinUCB(LinearBanditAgent):
     """Linear upper confidence bounds with disjoint models (Li et al., 2010).
 
     Args:
-        args: as in `LinearBanditAgent`.
         alpha: how many standard deviations the bound lies above the predicted reward.
-        kwargs: as in `LinearBanditAgent`.
     """
 
     parameters = {"alpha": np.float64}  # noqa: RUF012
@@ -217,9 +206,7 @@ class LinThompson(LinUCB):
     """Linear Thompson sampling (Agrawal and Goyal, 2013), with a model for each arm.
 
     Args:
-        args: as in `LinearBanditAgent`.
         alpha: factor of the posterior's standard deviation; correct is the noise's of the rewards.
-        kwargs: as in `LinearBanditAgent`.
     """
 
     bonus = sampled_bonus
@@ -231,5 +218,4 @@ class LinEpsilonGreedy(EpsilonGreedyBandit, LinearBanditAgent):
     Takes the arguments of `EpsilonGreedyBandit` and `LinearBanditAgent`.
     """
 
-    bonus = no_bonus
     pick = pick_epsilon_greedily

@@ -92,11 +92,9 @@ class UCB(UpperBoundBandit):
     Each arm is pulled once before any bound counts.
 
     Args:
-        args: as in `TableBandit`.
         variant: ``"ucb1"``: mean + c sqrt(2 ln t / n) after t pulls; ``"sutton_barto"``: mean +
             c sqrt(ln t / n) at the t-th pull.
         c: degree of exploration; by default 1 for UCB1 and 2 for Sutton and Barto's.
-        kwargs: as in `TableBandit`.
     """
 
     parameters = {"width": np.float64, "is_textbook": np.bool_}  # noqa: RUF012
@@ -183,9 +181,7 @@ class KLUCB(UpperBoundBandit):
     Each arm is pulled once first. Rewards must be in [0, 1]. Source: Garivier and Cappe (2011).
 
     Args:
-        args: as in `TableBandit`.
         c: of the bound's ln t + c ln ln t; the authors prove with 3 and recommend 0.
-        kwargs: as in `TableBandit`.
     """
 
     parameters = {"c": np.float64}  # noqa: RUF012
@@ -244,7 +240,6 @@ class Thompson(TableBandit):
     """Thompson sampling: pulls an arm with the probability that it is best (Thompson, 1933).
 
     Args:
-        args: as in `TableBandit`.
         likelihood: ``"bernoulli"``: rewards of 0 and 1 and a Beta prior; ``"gaussian"``: rewards
             with normal noise of a known deviation and a normal prior.
         prior_successes: first parameter of the Beta prior.
@@ -252,7 +247,6 @@ class Thompson(TableBandit):
         prior_mean: of the normal prior.
         prior_std: standard deviation of the normal prior.
         reward_std: standard deviation of the noise.
-        kwargs: as in `TableBandit`.
     """
 
     parameters = {  # noqa: RUF012
@@ -391,26 +385,18 @@ def gradient_step(agent: ScoreAgent, pull: Any, progress: Any) -> None:
         tables.scores[pull.row, arm] += advantage * (chosen - agent.arms[arm])
 
 
-@inlined
-def nothing_after(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """The preferences have moved already."""
-
-
 class GradientBandit(PreferenceBandit):
     """Gradient ascent on preferences (Sutton and Barto, section 2.8).
 
     Args:
-        args: as in `TableBandit`.
         learning_rate: step size, constant or scheduled.
         baseline: compare a reward with the average of those before it, as in the book's second
             edition (its drafts included the reward itself); else with 0.
-        kwargs: as in `TableBandit`.
     """
 
     parameters = {"baseline": np.bool_}  # noqa: RUF012
     choose_arm = choose_by_preference
     before_counting = gradient_step
-    learn_from_pull = nothing_after
 
     def __init__(
         self,
@@ -463,9 +449,7 @@ class Exp3(PreferenceBandit):
     Rewards lie between 0 and 1.
 
     Args:
-        args: as in `TableBandit`.
         mixing: share of uniformly random pulls, in (0, 1]; the paper's gamma.
-        kwargs: as in `TableBandit`.
     """
 
     parameters = {"mixing": np.float64}  # noqa: RUF012

@@ -319,15 +319,10 @@ class Runs:
             name: np.empty((len(seeds), len(self.moments), *known.shape[1:]), known.dtype)
             for name, known in self.known.items()
         }
-        self.start = self._start_of_training()
-
-    def _start_of_training(self) -> np.ndarray[Any, np.dtype[np.void]]:
-        """The progress record of a training at its first pull."""
-        progress = self.agent.progress()
-        progress["total_timesteps"], progress["remaining"] = self.n_pulls, 1.0
-        for name, schedule in self.agent.schedules().items():
-            progress[f"{name}_schedule"] = compiled_schedule(schedule)
-        return np.asarray(progress)
+        self.start: NDArray[Any] = agent.progress()  # of a training, at its first pull
+        self.start["total_timesteps"], self.start["remaining"] = self.n_pulls, 1.0
+        for name, schedule in agent.schedules().items():
+            self.start[f"{name}_schedule"] = compiled_schedule(schedule)
 
     def run(self, index: int) -> None:
         """Do one run, in blocks that end at the moments."""

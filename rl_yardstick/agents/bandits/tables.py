@@ -22,7 +22,6 @@ from rl_yardstick.agents.bandits.choosing import (
     choose_by_allowed_scores,
     count_and_learn,
     learn_one,
-    nothing_before,
     row_of_scores,
 )
 from rl_yardstick.agents.common.exploration import BOLTZMANN, action_probabilities, choose_action
@@ -91,7 +90,6 @@ class TableBandit(RuleBandit):
         env: environment with `Discrete` observations, the contexts, or its id.
         learning_rate: step size, for agents that have one.
         ignore_context: use one row for all contexts, as a pooled A/B test does.
-        kwargs: as in `BanditAlgorithm`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"BanditPolicy": BanditPolicy}
@@ -103,7 +101,6 @@ class TableBandit(RuleBandit):
     context_row = row_of_scores
     learn_from_reward = count_and_learn
     choose_allowed = choose_by_allowed_scores
-    before_counting = nothing_before
 
     def __init__(
         self,
@@ -189,10 +186,8 @@ class ValueBandit(TableBandit):
     """Explores around estimates of the arms' mean rewards, as the tabular agents do.
 
     Args:
-        args: as in `TableBandit`.
         learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N.
         initial_q: estimate of every arm at the start; high values are optimistic.
-        kwargs: as in `TableBandit`.
     """
 
     choose_arm = choose_by_value
@@ -231,9 +226,7 @@ class Boltzmann(ValueBandit):
     """Softmax of value / temperature.
 
     Args:
-        args: as in `ValueBandit`.
         temperature: above 0, constant or scheduled.
-        kwargs: as in `ValueBandit`.
     """
 
     strategy = BOLTZMANN

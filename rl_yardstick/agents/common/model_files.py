@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import re
-import sys
 import warnings
 import zipfile
 from collections import deque
@@ -276,12 +275,12 @@ class JsonAlgorithm(BaseAlgorithm):
         """Build an agent from a zip that `save` wrote.
 
         Args:
-            path: the zip.
+            path: the zip; ``.zip`` is appended if no file of that name exists.
             env: environment for further training, or None to predict only.
             device: ignored, as tables live on the CPU.
             custom_objects: values that replace those of the same name in the file; the replaced
                 ones are not read. Unknown names are ignored, as in the library.
-            print_system_info: print the library versions that the file was written with.
+            print_system_info: ignored.
             force_reset: begin a new episode at the next `learn`.
             kwargs: attributes to change.
 
@@ -289,13 +288,12 @@ class JsonAlgorithm(BaseAlgorithm):
             ValueError: if the zip holds another agent, is damaged, or does not fit ``env``; or if
                 ``custom_objects`` is not a dictionary.
         """
-        content = _content(path)
+        if not isinstance(path, io.BufferedIOBase):
+            path = Path(path)
+            path = path if path.exists() else path.with_name(f"{path.name}.zip")
+        content = content_of(path, MAX_ARCHIVE_BYTES)
         budget = Budget(len(content))
         members = read_model_members(content, budget)
-        if print_system_info:
-            text = members.get("system_info.txt", b"").decode("ascii", "replace")
-            # No control characters for the terminal.
-            sys.stdout.writelines(f"{shown(line)[1:-1]}\n" for line in text.splitlines())
         data = {**cls._read_data(members, budget, path, custom_objects), **kwargs}
         if env is not None:
             env = cls._wrap_env(env, data["verbose"])
@@ -351,15 +349,6 @@ class JsonAlgorithm(BaseAlgorithm):
             # Older files may contain more.
             if name not in cls._rebuilt
         }
-
-
-def _content(path: str | Path | io.BufferedIOBase) -> bytes:
-    """The whole file, read once; ``.zip`` is appended if no file of that name exists."""
-    if not isinstance(path, io.BufferedIOBase):
-        path = Path(path)
-        if not path.exists():
-            path = path.with_name(f"{path.name}.zip")
-    return content_of(path, MAX_ARCHIVE_BYTES)
 
 
 def _check_names(model: BaseAlgorithm, data: Iterable[str]) -> None:

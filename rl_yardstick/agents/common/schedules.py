@@ -8,6 +8,7 @@ it. `schedule_value` evaluates these four numbers, and is the only place with th
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch as th
@@ -45,6 +46,7 @@ def schedule_value(schedule: ScheduleRow, progress_remaining: float) -> float:
     return schedule.start * math.exp(rate * elapsed / schedule.end_fraction)
 
 
+@dataclass(eq=False)
 class ExponentialSchedule:
     """Decay from ``start`` to ``end`` by a constant factor per step.
 
@@ -57,25 +59,19 @@ class ExponentialSchedule:
         ValueError: if a value lies outside its range.
     """
 
-    def __init__(self, start: float, end: float, end_fraction: float = 1.0) -> None:
-        if not (start > 0 and end > 0):
-            raise ValueError(
-                f"an exponential schedule needs start and end above 0, not {start} and {end}"
-            )
-        if not 0 < end_fraction <= 1:
-            raise ValueError(f"end_fraction must lie in (0, 1], not {end_fraction}")
-        self.start = start
-        self.end = end
-        self.end_fraction = end_fraction
+    start: float
+    end: float
+    end_fraction: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (self.start > 0 and self.end > 0):
+            given = f"{self.start} and {self.end}"
+            raise ValueError(f"an exponential schedule needs start and end above 0, not {given}")
+        if not 0 < self.end_fraction <= 1:
+            raise ValueError(f"end_fraction must lie in (0, 1], not {self.end_fraction}")
 
     def __call__(self, progress_remaining: float) -> float:
         return schedule_value(_row(EXPONENTIAL, self), progress_remaining)
-
-    def __repr__(self) -> str:
-        return (
-            f"ExponentialSchedule(start={self.start}, end={self.end}, "
-            f"end_fraction={self.end_fraction})"
-        )
 
 
 def library_schedule(schedule: ExponentialSchedule) -> Schedule:

@@ -46,7 +46,6 @@ class LearningAlgorithm(OnlineAlgorithm):
         tie_breaking: which of several best actions to take while learning: a random one, or the
             first, as NumPy's argmax does. `predict` takes the first.
         policy_kwargs: further arguments of the policy.
-        kwargs: as in `OnlineAlgorithm`.
 
     Attributes:
         parameters: types of the settings that compiled functions read, by attribute name.

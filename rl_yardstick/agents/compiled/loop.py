@@ -43,13 +43,22 @@ class CompiledOnlyError(TypeError):
 
 def by_type(stub: Function) -> Function:
     """Make a compiled function that calls the function of that name of its first argument."""
+    return _dispatched(stub, None)
+
+
+def by_type_or_this(stub: Function) -> Function:
+    """As `by_type`; the function itself serves the classes that have none of that name."""
+    return _dispatched(stub, stub)
+
+
+def _dispatched(stub: Function, default: Function | None) -> Function:
     if IS_INTERPRETED:
         raise RuntimeError("agents need Numba's compiler: unset NUMBA_DISABLE_JIT")
     name = stub.__name__
     _NAMES.add(name)
 
     def choose(thing: Any, *others: Any) -> Any:
-        return getattr(getattr(_class_of(thing), name, None), "py_func", None)
+        return getattr(getattr(_class_of(thing), name, None), "py_func", default)
 
     options: Any = {**INLINED_OPTIONS, **PART_OPTIONS, "pipeline_class": PartCompiler}
     overload(stub, strict=False, jit_options=options)(choose)

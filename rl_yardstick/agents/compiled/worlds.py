@@ -195,32 +195,6 @@ CART_POLE_ENV = env_dtype(*((name, np.float64) for name in STATE))
 
 
 @inlined
-def swing(world: CartPole, env: Any) -> bool:
-    """One step of CartPole in Gymnasium's order of operations; returns whether it terminates."""
-    x, x_dot, theta, theta_dot = env.x, env.x_dot, env.theta, env.theta_dot
-    force = world.force_mag if env.action == 1 else -world.force_mag
-    cos_theta = math.cos(theta)
-    sin_theta = math.sin(theta)
-    temp = (force + world.polemass_length * (theta_dot * theta_dot) * sin_theta) / world.total_mass
-    theta_acc = (world.gravity * sin_theta - cos_theta * temp) / (
-        world.length * (4.0 / 3.0 - world.masspole * (cos_theta * cos_theta) / world.total_mass)
-    )
-    x_acc = temp - world.polemass_length * theta_acc * cos_theta / world.total_mass
-    if world.semi_implicit:
-        x_dot = x_dot + world.tau * x_acc
-        x = x + world.tau * x_dot
-        theta_dot = theta_dot + world.tau * theta_acc
-        theta = theta + world.tau * theta_dot
-    else:
-        x = x + world.tau * x_dot
-        x_dot = x_dot + world.tau * x_acc
-        theta = theta + world.tau * theta_dot
-        theta_dot = theta_dot + world.tau * theta_acc
-    env.x, env.x_dot, env.theta, env.theta_dot = x, x_dot, theta, theta_dot
-    return bool(abs(x) > world.x_threshold or abs(theta) > world.theta_threshold_radians)
-
-
-@inlined
 def bin_index(world: CartPole, env: Any) -> int:
     """The observation of `DiscretizeObservation`, computed from the state in single precision."""
     dims, bins = world.dims, world.bins
@@ -258,8 +232,32 @@ class CartPole(NamedTuple):
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
-        """Push the cart by ``env.action``; this draws no random number."""
-        env.terminated = swing(self, env)
+        """Push the cart by ``env.action``, in Gymnasium's order of operations, without chance."""
+        x, x_dot, theta, theta_dot = env.x, env.x_dot, env.theta, env.theta_dot
+        force = self.force_mag if env.action == 1 else -self.force_mag
+        cos_theta = math.cos(theta)
+        sin_theta = math.sin(theta)
+        temp = (
+            force + self.polemass_length * (theta_dot * theta_dot) * sin_theta
+        ) / self.total_mass
+        theta_acc = (self.gravity * sin_theta - cos_theta * temp) / (
+            self.length * (4.0 / 3.0 - self.masspole * (cos_theta * cos_theta) / self.total_mass)
+        )
+        x_acc = temp - self.polemass_length * theta_acc * cos_theta / self.total_mass
+        if self.semi_implicit:
+            x_dot = x_dot + self.tau * x_acc
+            x = x + self.tau * x_dot
+            theta_dot = theta_dot + self.tau * theta_acc
+            theta = theta + self.tau * theta_dot
+        else:
+            x = x + self.tau * x_dot
+            x_dot = x_dot + self.tau * x_acc
+            theta = theta + self.tau * theta_dot
+            theta_dot = theta_dot + self.tau * theta_acc
+        env.x, env.x_dot, env.theta, env.theta_dot = x, x_dot, theta, theta_dot
+        env.terminated = bool(
+            abs(x) > self.x_threshold or abs(theta) > self.theta_threshold_radians
+        )
         env.reward = 1.0
         env.monitor_reward = 1.0
         env.success = False
@@ -290,21 +288,6 @@ CAR_STATE = ("position", "velocity")
 MOUNTAIN_CAR_ENV = env_dtype(*((name, np.float64) for name in CAR_STATE))
 
 
-@inlined
-def drive(world: MountainCar, env: Any) -> bool:
-    """One step of MountainCar in Gymnasium's order of operations; returns whether it terminates."""
-    position, velocity = env.position, env.velocity
-    push = (env.action - 1) * world.force
-    velocity += push + math.cos(3 * position) * (-world.gravity)
-    velocity = min(max(velocity, -world.max_speed), world.max_speed)
-    position += velocity
-    position = min(max(position, world.min_position), world.max_position)
-    if position == world.min_position and velocity < 0:
-        velocity = 0.0
-    env.position, env.velocity = position, velocity
-    return bool(position >= world.goal_position and velocity >= world.goal_velocity)
-
-
 class MountainCar(NamedTuple):
     """MountainCar's constants under Gymnasium's names."""
 
@@ -319,8 +302,17 @@ class MountainCar(NamedTuple):
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
-        """Push the car by ``env.action``; this draws no random number."""
-        env.terminated = drive(self, env)
+        """Push the car by ``env.action``, in Gymnasium's order of operations, without chance."""
+        position, velocity = env.position, env.velocity
+        push = (env.action - 1) * self.force
+        velocity += push + math.cos(3 * position) * (-self.gravity)
+        velocity = min(max(velocity, -self.max_speed), self.max_speed)
+        position += velocity
+        position = min(max(position, self.min_position), self.max_position)
+        if position == self.min_position and velocity < 0:
+            velocity = 0.0
+        env.position, env.velocity = position, velocity
+        env.terminated = bool(position >= self.goal_position and velocity >= self.goal_velocity)
         env.reward = -1.0
         env.monitor_reward = -1.0
         env.success = False

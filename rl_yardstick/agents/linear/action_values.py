@@ -16,7 +16,7 @@ from rl_yardstick.agents.common.exploration import (
 from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import EPSILONS, FINITE, ExplorationDecay
 from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm
@@ -40,14 +40,9 @@ def next_value(agent: LinearAgent, env: Any, progress: Any) -> float:
     raise CompiledOnlyError
 
 
-@by_type
+@by_type_or_this
 def commit(agent: LinearAgent, env: Any, progress: Any) -> None:
     """Choose ``env.next_action`` before the update, if the update needs it."""
-
-
-@called
-def no_commitment(agent: LinearAgent, env: Any, progress: Any) -> None:
-    """Do nothing: the next action is chosen when it is due."""
 
 
 @called
@@ -93,7 +88,6 @@ class SemiGradientAlgorithm(TileAlgorithm):
     """Epsilon-greedy control on action values that are sums of weights over active tiles.
 
     Args:
-        args: as in `TileAlgorithm`.
         learning_rate: as in `TileAlgorithm`.
         exploration_fraction: share of training over which epsilon falls.
         exploration_initial_eps: epsilon at the start.
@@ -101,13 +95,11 @@ class SemiGradientAlgorithm(TileAlgorithm):
         exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
         tie_breaking: as in `LearningAlgorithm`.
         initial_q: every action's value at the start; high values are optimistic.
-        kwargs: as in `TileAlgorithm`.
     """
 
     # Called by the training loops; each algorithm defines `next_value`.
     choose_by_sums = choose_epsilon_greedily
     learn_from_step = semi_gradient_learning
-    commit = no_commitment
     ranges = {"initial_q": FINITE, **EPSILONS}  # noqa: RUF012
 
     def __init__(

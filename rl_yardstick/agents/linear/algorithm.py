@@ -151,7 +151,6 @@ class TileAlgorithm(WorkspaceAlgorithm):
         high: where they end, likewise. Values outside count as lying on the bound.
         engine: as in `TabularAlgorithm`; environments with a known model, CartPole and MountainCar
             can be compiled.
-        kwargs: as in `OnlineAlgorithm`.
 
     Raises:
         ValueError: if an argument is outside its range, a space does not fit, a dimension has no

@@ -71,12 +71,10 @@ class SoftmaxAlgorithm(TileAlgorithm):
     """A policy gradient on preferences that are sums of weights over active tiles.
 
     Args:
-        args: as in `TileAlgorithm`.
         learning_rate: step size of the policy, as in `TileAlgorithm`.
         initial_preferences: each action's preference at the start, a number or a list of A.
         gamma_power: multiply the policy's update at step t of an episode by gamma to the power t,
             as in the book's pseudocode; many programs leave this out.
-        kwargs: as in `TileAlgorithm`.
     """
 
     parameters = {"gamma_power": np.bool_}  # noqa: RUF012
@@ -156,10 +154,8 @@ class ActorCritic(SoftmaxAlgorithm):
     episode is truncated, the target bootstraps from its last state.
 
     Args:
-        args: as in `TileAlgorithm`.
         learning_rate: step size of the policy, constant or scheduled, as in `TileAlgorithm`.
         value_step_size: step size of the state values, also divided by the number of tilings.
-        kwargs: as in `SoftmaxAlgorithm`.
     """
 
     parameters = {"value_step_size": np.float64}  # noqa: RUF012
@@ -210,14 +206,6 @@ def keep_step(agent: LinearAgent, env: Any, i: int) -> None:
 
 
 @called
-def make_returns(rewards: Floats, n_steps: int, gamma: float, following: float) -> None:
-    """Turn the rewards of an episode into its returns, from the last to the first."""
-    for t in range(n_steps - 1, -1, -1):
-        following = rewards[t] + gamma * following
-        rewards[t] = following
-
-
-@called
 def reinforce_step(agent: LinearAgent, i: int, t: int, step: float) -> float:
     """Learn from step ``t`` of a finished episode; return its return less the baseline."""
     kept, room, settings = agent.memory, agent.room, agent.settings
@@ -240,7 +228,9 @@ def learn_from_episode(agent: LinearAgent, env: Any, progress: Any, i: int) -> N
     if len(kept.values) > 0 and not env.terminated:
         look(agent, env, AFTER, room.next_tiles)
         following = state_value(kept.values, room.next_tiles)
-    make_returns(kept.rewards[i], n_steps, settings.gamma, following)
+    for t in range(n_steps - 1, -1, -1):
+        following = kept.rewards[i, t] + settings.gamma * following
+        kept.rewards[i, t] = following
     step = progress.learning_rate / len(room.tiles)
     for t in range(n_steps):
         total += abs(reinforce_step(agent, i, t, step))
@@ -269,11 +259,9 @@ class Reinforce(SoftmaxAlgorithm):
     last state.
 
     Args:
-        args: as in `TileAlgorithm`.
         learning_rate: step size of the policy, constant or scheduled, as in `TileAlgorithm`.
         baseline: subtracted from returns: ``"none"``, or ``"value"``, a learnt state value.
         value_step_size: step size of that value, also divided by the number of tilings.
-        kwargs: as in `SoftmaxAlgorithm`.
     """
 
     parameters = {"value_step_size": np.float64}  # noqa: RUF012

@@ -99,24 +99,6 @@ def fill_probabilities(logits: Singles, normalizer: float, probabilities: Any) -
     return entropy
 
 
-@inlined
-def turn_into_slopes(
-    probabilities: Any,
-    logits: Singles,
-    normalizer: float,
-    entropy: float,
-    action: int,
-    by_log: float,
-    by_entropy: float,
-) -> None:
-    """Replace the probabilities by the derivatives of the loss by the logits."""
-    for k in range(len(logits)):
-        probability = float(probabilities[k])
-        surplus = float(logits[k]) - normalizer + entropy
-        slope = -probability * (by_log + by_entropy * surplus)
-        probabilities[k] = np.float32(slope + by_log if k == action else slope)
-
-
 # The library's rollout buffer, whose arrays are used directly: advantages and minibatches.
 
 
@@ -304,7 +286,10 @@ def _policy_errors(learner: Any, n: int, clip_range: float) -> None:
         moves = ratio == bounded or advantage * ratio < advantage * bounded
         by_log = -advantage * ratio / n if moves else 0.0
         entropy = fill_probabilities(row, normalizer, slopes[i])
-        turn_into_slopes(slopes[i], row, normalizer, entropy, action, by_log, by_entropy)
+        for k in range(len(row)):
+            surplus = float(row[k]) - normalizer + entropy
+            slope = -float(slopes[i, k]) * (by_log + by_entropy * surplus)
+            slopes[i, k] = np.float32(slope + by_log if k == action else slope)
         losses.policy_gradient -= gain / n
         losses.likelihood -= advantage * log_prob / n
         losses.entropy -= entropy / n

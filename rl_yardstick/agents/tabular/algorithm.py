@@ -48,7 +48,6 @@ from rl_yardstick.agents.tabular.updates import (
     Tables,
     TabularAgent,
     act_on_values,
-    no_commitment,
     td_learning,
 )
 from rl_yardstick.agents.tabular.workspace import Workspace, WorkspaceAlgorithm
@@ -181,7 +180,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         mask_actions: choose among the actions that the environment allows, and bootstrap from
             those allowed next. The environment's method `action_masks()` must depend on the
             observation only. At an observation never visited, all actions are allowed.
-        kwargs: as in `OnlineAlgorithm`.
 
     Attributes:
         masks_are_known: whether the policy has the masks of all states.
@@ -202,7 +200,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
     # Called by the training loops; each algorithm defines `next_value`.
     act = act_on_values
     learn_from_step = td_learning
-    commit = no_commitment
 
     _rebuilt = (*WorkspaceAlgorithm._rebuilt, *("masks_are_known", "_infos", "last_steps"))
     excluded_from_states = ("last_steps",)
@@ -253,6 +250,14 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             check_masks_exist(self.env)
         check_space(self, "observations", self.observation_space)
         check_space(self, "actions", self.action_space)
+
+    def _refuse_gaussian_noise(self, role: str) -> None:
+        """Raise ValueError for an exploration without known probabilities, which are needed."""
+        if self.exploration == "gaussian_noise":
+            raise ValueError(
+                f"{role} needs the probabilities of its actions, which gaussian_noise does not "
+                "give: take epsilon_greedy or boltzmann"
+            )
 
     def _policy_arguments(self) -> dict[str, Any]:
         return {"n_tables": self.n_tables, **self.policy_kwargs}

@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.agents.tabular.one_step import QLearning
@@ -34,12 +34,6 @@ class LearntModel(NamedTuple):
     # The pairs that planning draws from, in the order of their first visit, shape (S * A,).
     pairs: Ints
     n_pairs: Ints  # the number of these pairs, shape (1,)
-
-
-@inlined
-def n_kept(model: Any, obs: int, action: int) -> int:
-    """The number of outcomes of a pair in the model."""
-    return int(min(model.counts[obs, action], model.next_obs.shape[2]))
 
 
 @inlined
@@ -153,10 +147,10 @@ def remember(agent: TabularAgent, env: Any) -> None:
     raise CompiledOnlyError
 
 
-@by_type
+@by_type_or_this
 def imagined_reward(agent: TabularAgent, obs: int, action: int, reward: float) -> float:
     """The reward in planning, given the model's ``reward``."""
-    raise CompiledOnlyError
+    return reward
 
 
 @inlined
@@ -165,12 +159,6 @@ def remember_outcome(agent: TabularAgent, env: Any) -> None:
     if agent.memory.counts[env.obs, env.action] == 0:
         add_pair(agent.memory, env.obs, env.action)
     note_outcome(agent.memory, env)
-
-
-@inlined
-def remembered_reward(agent: TabularAgent, obs: int, action: int, reward: float) -> float:
-    """The model's reward."""
-    return reward
 
 
 @inlined
@@ -186,7 +174,8 @@ def imagine_step(agent: TabularAgent, progress: Any) -> None:
     # The model of an untried pair: it stays in its state, with reward 0.
     reward, next_obs, goes_on = 0.0, obs, True
     if model.counts[obs, action] > 0:
-        k = int((drawn - int(drawn)) * n_kept(model, obs, action))
+        n_kept = min(model.counts[obs, action], model.next_obs.shape[2])
+        k = int((drawn - int(drawn)) * n_kept)
         reward, next_obs = model.rewards[obs, action, k], model.next_obs[obs, action, k]
         goes_on = not model.terminated[obs, action, k]
     target = imagined_reward(agent, obs, action, reward)
@@ -224,17 +213,14 @@ class DynaQ(ModelKeeper, QLearning):
     Updates by planning are not counted: ``"sample_average"`` is 1/N after N real visits.
 
     Args:
-        args: as in `TabularAlgorithm`.
         planning_steps: updates from the model after each step of an environment.
         outcomes_kept: as in `ModelKeeper`.
-        kwargs: as in `TabularAlgorithm`.
     """
 
     parameters = {"planning_steps": np.int64}  # noqa: RUF012
     ranges = {"planning_steps": whole(0), "outcomes_kept": whole(1)}  # noqa: RUF012
     learn_from_step = learn_and_plan
     remember = remember_outcome
-    imagined_reward = remembered_reward
 
     def __init__(
         self, *args: Any, planning_steps: int = 5, outcomes_kept: int = 1, **kwargs: Any
@@ -307,9 +293,7 @@ class DynaQPlus(DynaQ):
     Time is counted in steps of all environments together.
 
     Args:
-        args: as in `DynaQ`.
         kappa: weight of the bonus.
-        kwargs: as in `DynaQ`.
     """
 
     policy_aliases = {"QTablePolicy": DatedModelPolicy}  # noqa: RUF012

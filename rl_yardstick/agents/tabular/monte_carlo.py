@@ -75,10 +75,8 @@ class RecordAlgorithm(EpisodicAlgorithm):
     treated as truncated after ``longest_episode`` steps, and its rest as another episode.
 
     Args:
-        args: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`; the textbook's is ``"sample_average"``.
         longest_episode: maximal number of stored steps of an episode, at least 1.
-        kwargs: as in `TabularAlgorithm`.
     """
 
     learn_in = record_and_learn
@@ -161,9 +159,7 @@ class MonteCarlo(RecordAlgorithm):
     up to the environment: Blackjack has some.
 
     Args:
-        args: as in `RecordAlgorithm`.
         every_visit: learn from every visit of an entry in an episode, not only from the first.
-        kwargs: as in `RecordAlgorithm`.
     """
 
     parameters = {"every_visit": np.bool_}  # noqa: RUF012
@@ -232,7 +228,6 @@ class OffPolicyMonteCarlo(RecordAlgorithm):
 
     Args:
         args: as in `RecordAlgorithm`; ``learning_rate`` can only be ``"sample_average"``.
-        kwargs: as in `RecordAlgorithm`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": ImportanceTablePolicy}

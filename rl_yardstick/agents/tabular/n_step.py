@@ -9,7 +9,7 @@ import numpy as np
 
 from rl_yardstick.agents.common.exploration import action_probability, expected_value, highest_value
 from rl_yardstick.agents.common.settings import SHARE, whole
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
 from rl_yardstick.agents.tabular.one_step import (
@@ -102,14 +102,6 @@ class EpisodicAlgorithm(TabularAlgorithm):
                 "skip_terminal_update is for the agents that learn from single steps"
             )
 
-    def _refuse_gaussian_noise(self, role: str) -> None:
-        """Raise ValueError for an exploration without known probabilities, which are needed."""
-        if self.exploration == "gaussian_noise":
-            raise ValueError(
-                f"{role} needs the probabilities of the actions, which gaussian_noise does not "
-                "give: take epsilon_greedy or boltzmann"
-            )
-
 
 # The last n steps of each environment, and learning from them together.
 #
@@ -126,10 +118,10 @@ class Windows(NamedTuple):
     lengths: Ints  # number of steps in it, shape (n_envs,)
 
 
-@by_type
+@by_type_or_this
 def backed_up(agent: TabularAgent, progress: Any, obs: int, action: int, later: float) -> float:
-    """The backed-up value of a state in the window; ``later`` is the return after its action."""
-    raise CompiledOnlyError
+    """The backed-up value of a state in the window: ``later``, the return after its action."""
+    return later
 
 
 @inlined
@@ -186,10 +178,8 @@ class WindowAlgorithm(EpisodicAlgorithm):
     A truncated episode bootstraps from its last state.
 
     Args:
-        args: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`.
         n_steps: number of rewards in a target, at least 1.
-        kwargs: as in `TabularAlgorithm`.
     """
 
     learn_in = learn_from_window
@@ -209,20 +199,11 @@ class WindowAlgorithm(EpisodicAlgorithm):
 # n-step SARSA.
 
 
-@inlined
-def sampled_return(
-    agent: TabularAgent, progress: Any, obs: int, action: int, later: float
-) -> float:
-    """The sampled return after the action."""
-    return later
-
-
 class NStepSARSA(WindowAlgorithm):
     """n-step SARSA (Sutton and Barto, section 7.2); with one step it is SARSA."""
 
     commit = commit_to_next_action
     next_value = committed_value
-    backed_up = sampled_return
 
 
 # n-step tree backup.
@@ -273,10 +254,8 @@ class NStepTreeBackup(WindowAlgorithm):
     sampling. With one step it is Expected SARSA or, for the greedy target policy, Q-learning.
 
     Args:
-        args: as in `WindowAlgorithm`.
         target_policy: the policy whose values it learns: the ``"exploring"`` policy, with the
             present epsilon or temperature, or the ``"greedy"`` one.
-        kwargs: as in `WindowAlgorithm`.
     """
 
     parameters = {"targets_greedy": np.bool_}  # noqa: RUF012
@@ -326,15 +305,9 @@ class Traces(NamedTuple):
     expected: Floats
 
 
-@by_type
+@by_type_or_this
 def trace_kept(agent: TabularAgent, env: Any) -> float:
     """The factor of earlier traces after the action: 1, or 0 if it cuts them."""
-    raise CompiledOnlyError
-
-
-@inlined
-def kept_whole(agent: TabularAgent, env: Any) -> float:
-    """On-policy methods never cut traces."""
     return 1.0
 
 
@@ -403,20 +376,17 @@ class TraceAlgorithm(EpisodicAlgorithm):
     step size falls below 1e-12.
 
     Args:
-        args: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`; an entry's trace keeps that of its last visit.
         trace_decay: lambda, in [0, 1]; with 0 only the last step's entry is updated.
         trace_type: the new trace at a visit, given the decayed trace e of earlier visits:
             ``"accumulating"`` e + 1; ``"replacing"`` 1, and the traces of the state's other
             actions stay; ``"dutch"`` e + 1 - learning_rate * e, with the update of true online
             TD(lambda).
-        kwargs: as in `TabularAlgorithm`.
     """
 
     parameters = {"trace_decay": np.float64, "trace_kind": np.int64}  # noqa: RUF012
     ranges = {"trace_decay": SHARE}  # noqa: RUF012
     learn_in = learn_along_traces
-    trace_kept = kept_whole
 
     def __init__(
         self,

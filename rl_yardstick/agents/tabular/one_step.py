@@ -69,11 +69,7 @@ class ExpectedSARSA(TabularAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        if self.exploration == "gaussian_noise":
-            raise ValueError(
-                "expected_sarsa needs the probabilities of its actions, which gaussian_noise does "
-                "not give: take epsilon_greedy or boltzmann"
-            )
+        self._refuse_gaussian_noise("expected_sarsa")
 
 
 # Double Q-learning.

@@ -44,7 +44,6 @@ class OptimisticAlgorithm(TabularAlgorithm):
         tie_breaking: as in `LearningAlgorithm`.
         engine: as in `TabularAlgorithm`.
         policy_kwargs: further arguments of the policy.
-        kwargs: as in `TabularAlgorithm`.
 
     Raises:
         ValueError: if an argument is outside its range, a space does not fit, or ``gamma`` is 1
@@ -139,11 +138,9 @@ class QLearningUCB(OptimisticAlgorithm):
     looks better than it is until it was tried often, and so do all pairs that lead there.
 
     Args:
-        args: as in `OptimisticAlgorithm`.
         bonus_scale: c of the bonus c / sqrt(N).
         horizon: H of the step sizes: the first estimates are forgotten after about H visits. By
             default 1 / (1 - gamma); with 0 an entry is the mean of all its targets.
-        kwargs: as in `OptimisticAlgorithm`.
 
     Raises:
         ValueError: as `OptimisticAlgorithm`, and if ``gamma`` is 1 without a ``horizon``.
@@ -335,10 +332,8 @@ class RMax(ModelKeeper, OptimisticAlgorithm):
     Planning is done once for each pair, and takes longer if ``gamma`` is closer to 1.
 
     Args:
-        args: as in `OptimisticAlgorithm`.
         known_after: m, the number of tries after which a pair is known.
         tolerance: maximal distance of values from the optimum of the model.
-        kwargs: as in `OptimisticAlgorithm`.
 
     Raises:
         ValueError: as `OptimisticAlgorithm`, and if ``gamma`` is 1.

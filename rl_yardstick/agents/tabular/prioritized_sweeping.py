@@ -202,15 +202,6 @@ def sweep(agent: TabularAgent, progress: Any) -> None:
 
 
 @inlined
-def sweep_all(agent: TabularAgent, progress: Any) -> None:
-    """Do ``planning_steps`` updates, or fewer if the queue is empty."""
-    for _ in range(agent.settings.planning_steps):
-        if agent.memory.n_queued[0] == 0:
-            break
-        sweep(agent, progress)
-
-
-@inlined
 def remember_and_sweep(agent: TabularAgent, envs: Any, progress: Any) -> None:
     """For each environment, in order: store its step, and update the most urgent pairs."""
     total_error = 0.0
@@ -221,7 +212,10 @@ def remember_and_sweep(agent: TabularAgent, envs: Any, progress: Any) -> None:
             agent.tables.visit_counts[0, env.obs, env.action] += 1
             pair = env.obs * agent.tables.values.shape[2] + env.action
             total_error += abs(notice(agent, pair))
-            sweep_all(agent, progress)
+            for _ in range(agent.settings.planning_steps):
+                if agent.memory.n_queued[0] == 0:
+                    break
+                sweep(agent, progress)
         env.obs = env.new_obs
     progress.mean_td_error = total_error / len(envs)
 
@@ -238,10 +232,8 @@ class PrioritizedSweeping(ModelKeeper):
     Updates by planning are not counted: ``"sample_average"`` is 1/N after N real visits.
 
     Args:
-        args: as in `TabularAlgorithm`.
         planning_steps: maximal number of updates after each step of an environment.
         threshold: errors above this are queued.
-        kwargs: as in `TabularAlgorithm`.
     """
 
     policy_aliases = {"QTablePolicy": SweepingPolicy}  # noqa: RUF012

@@ -11,7 +11,7 @@ from rl_yardstick.agents.common.exploration import (
     random_action,
 )
 from rl_yardstick.agents.common.settings import step_size
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import generator_of, next_uniform
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.machine_code.compiling import inlined
@@ -152,14 +152,9 @@ def next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> floa
     raise CompiledOnlyError
 
 
-@by_type
+@by_type_or_this
 def commit(agent: TabularAgent, env: Any, progress: Any) -> None:
     """Choose ``env.next_action``, or store anything else that is needed from unchanged tables."""
-
-
-@inlined
-def no_commitment(agent: TabularAgent, env: Any, progress: Any) -> None:
-    """Do nothing: the next action is chosen when it is due."""
 
 
 @inlined

@@ -96,15 +96,6 @@ class Workspace:
             self.progress[name] for name in names
         )
 
-    def note_progress(
-        self, exploration: float, learning_rate: float, episodes: int, mean_td_error: float = 0.0
-    ) -> None:
-        """Set the exploration rate, the step size, the episodes so far, and the last error."""
-        self.exploration[0] = exploration
-        self.learning_rate[0] = learning_rate
-        self.episodes[0] = episodes
-        self.mean_td_error[0] = mean_td_error
-
     def choose(self) -> Ints:
         """An action for each observation: the one committed to, if there is one."""
         self._check("obs", self._act(self.bench.address, 0.0, 0.0))
@@ -186,8 +177,10 @@ class WorkspaceAlgorithm(LearningAlgorithm):
 
     def _note_progress(self, workspace: Workspace) -> None:
         remaining = self._current_progress_remaining
-        exploration, step_size = self.exploration_schedule(remaining), self.lr_schedule(remaining)
-        workspace.note_progress(exploration, step_size, self._episode_num, self.mean_td_error)
+        workspace.exploration[0] = self.exploration_schedule(remaining)
+        workspace.learning_rate[0] = self.lr_schedule(remaining)
+        workspace.episodes[0] = self._episode_num
+        workspace.mean_td_error[0] = self.mean_td_error
 
     def _choose_actions(self) -> Ints:
         actions: Ints = self._present_workspace().act(self._last_obs)
