@@ -25,21 +25,13 @@ from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, Tra
 
 @dataclass(frozen=True)
 class PolicyReturn:
-    """Moments of one episode, averaged over the distribution of starting states.
+    """Moments of one episode, averaged over the distribution of starting states."""
 
-    Attributes:
-        expected_return: the mean of the (discounted) sum of rewards.
-        return_variance: its variance.
-        expected_length: the mean number of steps; infinite where episodes may never end.
-        length_variance: its variance; NaN where the mean is infinite.
-        success_rate: the probability that the episode succeeds; None where success was not defined.
-    """
-
-    expected_return: float
-    return_variance: float
-    expected_length: float
-    length_variance: float
-    success_rate: float | None
+    expected_return: float  #: the mean of the (discounted) sum of rewards
+    return_variance: float  #: its variance
+    expected_length: float  #: the mean number of steps; infinite where episodes may never end
+    length_variance: float  #: its variance; NaN where the mean is infinite
+    success_rate: float | None  #: probability of success; None where success was not defined
 
 
 def over_starts(initial: Floats, moments: Floats, *, with_success: bool) -> PolicyReturn:

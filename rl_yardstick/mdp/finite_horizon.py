@@ -17,22 +17,16 @@ Actions = NDArray[np.unsignedinteger]
 
 @dataclass(frozen=True, eq=False)
 class FiniteHorizonPlan:
-    """An optimal policy under a time limit.
+    """An optimal policy under a time limit."""
 
-    Attributes:
-        values: the optimal expected (discounted) sum of rewards from each state at step 0, shape
-            (S,); zero for states that cannot be reached.
-        actions_left: the greedy action, the first among ties within 1e-12 of the best value, with
-            1, 2, ... steps left: shape (m, S) of a small unsigned integer type. With more than m
-            steps left, the last row applies.
-        horizon: the number of steps after which the episode is cut off.
-        start_value: the mean of ``values`` over the starting states.
-    """
-
+    #: The optimal expected (discounted) sum of rewards from each state at step 0, shape (S,); zero
+    #: for states that cannot be reached.
     values: Floats
+    #: The greedy action, the first among ties within 1e-12 of the best value, with 1, 2, ... steps
+    #: left: shape (m, S). With more than m steps left, the last row applies.
     actions_left: Actions
-    horizon: int
-    start_value: float
+    horizon: int  #: the number of steps after which the episode is cut off
+    start_value: float  #: the mean of ``values`` over the starting states
 
     @property
     def policy(self) -> Actions:

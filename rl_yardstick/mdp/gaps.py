@@ -32,22 +32,16 @@ SAME = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class GapByState:
-    """The gap between the optimum and a policy, split over the states in which it acts.
+    """The gap between the optimum and a policy, split over the states in which it acts."""
 
-    Attributes:
-        optimum: the highest expected return under the time limit.
-        value: the policy's expected return.
-        losses: the return lost in each state per episode, shape (S,). Losses are at least 0, and
-            sum to ``optimum - value`` up to rounding.
-        visits: how often an episode acts in each state, shape (S,).
-        action_values: the optimal action values, averaged over the steps at which the policy is in
-            the state, shape (S, A); 0 in states that the policy never visits.
-    """
-
-    optimum: float
-    value: float
+    optimum: float  #: the highest expected return under the time limit
+    value: float  #: the policy's expected return
+    #: The return lost in each state per episode, shape (S,). Losses are at least 0, and sum to
+    #: ``optimum - value`` up to rounding.
     losses: Floats
-    visits: Floats
+    visits: Floats  #: how often an episode acts in each state, shape (S,)
+    #: The optimal action values, averaged over the steps at which the policy is in the state, shape
+    #: (S, A); 0 in states that the policy never visits.
     action_values: Floats
 
     @property
@@ -126,15 +120,11 @@ def greedy_repairs(
 
 @dataclass(frozen=True, eq=False)
 class FirstDifferences:
-    """Where two policies first differ in an episode, and how that changes the return.
+    """Where two policies first differ in an episode, and how that changes the return."""
 
-    Attributes:
-        met: the probability that an episode's first difference is in each state, shape (S,).
-        gains: what the first policy gains over the second by these differences, in return per
-            episode, shape (S,). They sum to the difference of the two returns.
-    """
-
-    met: Floats
+    met: Floats  #: the probability that an episode's first difference is in each state, shape (S,)
+    #: What the first policy gains over the second by these differences, in return per episode,
+    #: shape (S,). They sum to the difference of the two returns.
     gains: Floats
 
 
@@ -212,20 +202,15 @@ SETTLED = 1e-14
 class PolicyValues:
     """The values of a stationary policy.
 
-    Attributes:
-        values: state values V(s), shape (S,).
-        action_values: action values Q(s, a), shape (S, A).
-        advantages: Q(s, a) - V(s), shape (S, A).
-
     All are NaN in unreachable states, and, without discount, where the episode may never end.
     """
 
-    values: Floats
-    action_values: Floats
+    values: Floats  #: state values V(s), shape (S,)
+    action_values: Floats  #: action values Q(s, a), shape (S, A)
 
     @property
     def advantages(self) -> Floats:
-        """Action values minus state values."""
+        """Q(s, a) - V(s), shape (S, A)."""
         return self.action_values - self.values[:, None]
 
 

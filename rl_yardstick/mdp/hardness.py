@@ -53,13 +53,7 @@ class Hardness:
 
 
 def hardness_of(model: TransitionModel, horizon: int, success: Bools | None = None) -> Hardness:
-    """All measures of a decision process.
-
-    Args:
-        model: the decision process.
-        horizon: the time limit in steps.
-        success: the outcomes that end an episode well, bool of shape (S, A, K), or None.
-    """
+    """All measures; ``success`` are the outcomes that end an episode well, bool of (S, A, K)."""
     plan = finite_horizon_optimum(model, horizon)
     largest, connected = diameter(model) or (None, None)
     smallest, mean = action_gaps(model, plan)
@@ -152,11 +146,7 @@ def action_gaps(
 
     The gap of Simchowitz and Jamieson, Non-Asymptotic Gap-Dependent Regret Bounds for Tabular
     MDPs, 2019, with all steps of the time limit left. Actions within 1e-9 of the best count as
-    optimal. States without a suboptimal action have no gap.
-
-    Args:
-        model: the decision process.
-        plan: its optimum under the time limit.
+    optimal. States without a suboptimal action have no gap. ``plan`` is the model's optimum.
 
     Returns:
         The smallest gap of a reachable state, and the mean over states, weighted by the expected

@@ -184,6 +184,7 @@ def _dict_space(pairs: list[list[Any]]) -> spaces.Dict:
     return spaces.Dict([(key, space) for key, space in pairs])
 
 
+_system_info = cache(get_system_info)
 _RANGE = _attributes("start", "end", "end_fraction")
 _ARRAY: dict[str, Callable[[Any], Any]] = {
     "dtype": _array_dtype,
@@ -384,10 +385,13 @@ def _zipped(data: Mapping[str, Any], params: dict[str, Any]) -> bytes:
     The JSON has one line for each attribute. With the library's deeper indentation, writing would
     take twice as long as all the rest.
     """
-    members = {"pytorch_variables.pth": _saved({})}
-    members |= {f"{name}.pth": _saved(tables) for name, tables in params.items()}
+    members = {}
+    for name, tables in {"pytorch_variables": {}, **params}.items():
+        buffer = io.BytesIO()
+        th.save(tables, buffer)
+        members[f"{name}.pth"] = buffer.getvalue()
     members["_stable_baselines3_version"] = sb3.__version__.encode()
-    members["system_info.txt"] = _system_info().encode()
+    members["system_info.txt"] = _system_info(print_info=False)[1].encode()
     lines = [f"{json.dumps(name)}: {json.dumps(value)}" for name, value in data.items()]
     members["data"] = ("{\n" + ",\n".join(lines) + "\n}").encode()
     buffer = io.BytesIO()
@@ -395,17 +399,6 @@ def _zipped(data: Mapping[str, Any], params: dict[str, Any]) -> bytes:
         for name, content in members.items():
             archive.writestr(name, content)
     return buffer.getvalue()
-
-
-def _saved(tables: dict[str, Any]) -> bytes:
-    buffer = io.BytesIO()
-    th.save(tables, buffer)
-    return buffer.getvalue()
-
-
-@cache
-def _system_info() -> str:
-    return get_system_info(print_info=False)[1]
 
 
 class TablePolicy(BasePolicy):

@@ -269,7 +269,13 @@ def choose_engine(
         agent.engine_in_use = "interpreted: asked for"
         return None
     try:
-        world = _world_for(agent, callback)
+        check_class(type(agent))
+        if unknown := unknown_callbacks(callback):
+            raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
+        agent.check_compilable()
+        for schedule in agent.schedules().values():
+            compiled_schedule(schedule)
+        world = observed_world(agent.env)
     except NotCompilable as reason:
         if agent.engine == "compiled":
             raise ValueError(f"engine: compiled is not possible: {reason}") from None
@@ -285,18 +291,6 @@ def choose_engine(
             return None
         agent.engine_in_use = "compiled, not bit for bit: the environment draws in its own way"
     return CompiledEngine(agent, world, callback, log_interval)
-
-
-def _world_for(agent: LearningAlgorithm, callback: BaseCallback) -> tuple[Any, Any]:
-    check_class(type(agent))
-    unknown = unknown_callbacks(callback)
-    if unknown:
-        raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
-    agent.check_compilable()
-    for schedule in agent.schedules().values():
-        compiled_schedule(schedule)
-    assert agent.env is not None
-    return observed_world(agent.env)
 
 
 def check_class(algorithm: type) -> None:

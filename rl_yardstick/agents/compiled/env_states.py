@@ -177,20 +177,6 @@ COMPENSATED_SUM = sys.version_info >= (3, 12)
 VECTOR_STATES: dict[type, tuple[str, ...]] = {CartPole: STATE, MountainCar: CAR_STATE}
 
 
-# Fields that acting fills in for learning.
-_ESTIMATES = (("value", np.float64), ("log_probability", np.float64))
-
-
-@lru_cache(maxsize=8)
-def record_type(names: tuple[str, ...], *, has_vectors: bool) -> np.dtype[np.void]:
-    """The record type of environments with a state of these numbers, also as vectors."""
-    state: Any = [(name, np.float64) for name in names] or [("state", np.int64)]
-    vectors: Any = [
-        (name, np.float32, (len(names),)) for name in ("vector", "next_vector", "new_vector")
-    ]
-    return env_dtype(*state, *_ESTIMATES, *(vectors if has_vectors else ()))
-
-
 class EnvStates:
     """Environments, with a record for each of them.
 
@@ -205,8 +191,13 @@ class EnvStates:
         self.seen = seen
         # The state is a vector of these names, or a number if there are none.
         self.vector_state = VECTOR_STATES.get(type(getattr(world, "dynamics", world)), ())
-        kind = record_type(self.vector_state, has_vectors=isinstance(seen, OwnVectors))
-        self.records = env_records(vec_env.num_envs, kind)
+        state: Any = [(name, np.float64) for name in self.vector_state] or [("state", np.int64)]
+        # Fields that acting fills in for learning.
+        state += [("value", np.float64), ("log_probability", np.float64)]
+        if isinstance(seen, OwnVectors):
+            vectors = ("vector", "next_vector", "new_vector")
+            state += [(name, np.float32, (len(self.vector_state),)) for name in vectors]
+        self.records = env_records(vec_env.num_envs, env_dtype(*state))
         self.monitors = [monitor_of(env) for env in vec_env.envs]
         # Monitor keeps the rewards of the running episode, so we keep them too.
         self._unfinished: list[list[Floats]] = [[] for _ in vec_env.envs]
@@ -260,28 +251,27 @@ class EnvStates:
     def write(self) -> None:
         """Copy the records into the state of the environments."""
         for i, env in enumerate(self.vec_env.envs):
-            self._write_state(env.unwrapped, self.records[i])
+            base: Any = env.unwrapped
+            record = self.records[i]
+            if self.vector_state:
+                base.state = np.array([record[name] for name in self.vector_state])
+                if hasattr(base, "steps_beyond_terminated"):
+                    base.steps_beyond_terminated = None
+            else:
+                base.s = int(record["state"])
+                if hasattr(base, "lastaction"):
+                    base.lastaction = None if record["elapsed"] == 0 else int(record["action"])
+                if hasattr(base, "pulls_done"):
+                    base.pulls_done = int(record["elapsed"])
             for layer in layers(env):
                 if isinstance(layer, TimeLimit):
-                    vars(layer)["_elapsed_steps"] = int(self.records[i]["elapsed"])
+                    vars(layer)["_elapsed_steps"] = int(record["elapsed"])
                 elif isinstance(layer, Monitor):
                     chunks = self._unfinished[i]
                     layer.rewards = np.concatenate(chunks).tolist() if chunks else []
                     layer.needs_reset = False
             (shown,) = self.observations(self.records[i : i + 1], "")
             next(iter(self.vec_env.buf_obs.values()))[i] = shown
-
-    def _write_state(self, base: Any, record: Any) -> None:
-        if self.vector_state:
-            base.state = np.array([record[name] for name in self.vector_state])
-            if hasattr(base, "steps_beyond_terminated"):
-                base.steps_beyond_terminated = None
-            return
-        base.s = int(record["state"])
-        if hasattr(base, "lastaction"):
-            base.lastaction = None if record["elapsed"] == 0 else int(record["action"])
-        if hasattr(base, "pulls_done"):
-            base.pulls_done = int(record["elapsed"])
 
     def keep_rewards(self, episodes: Episodes, rewards: Floats) -> None:
         """Keep the rewards of unfinished episodes after a block."""

@@ -431,21 +431,16 @@ def _finite_model(env: Env) -> FiniteModel:
     monitor = monitor_of(env)
     seen_by_monitor = model if monitor is None else transition_model(monitor.env)
     assert seen_by_monitor is not None
-    starts = np.flatnonzero(model.initial)
+    starts, numbers = np.flatnonzero(model.initial), np.arange(len(observations))
+    if np.issubdtype(observations.dtype, np.integer) and observations.ndim == 1:
+        numbers = observations.astype(np.int64)  # others are replaced by the numbers of the states
     return FiniteModel(
         time_limit=time_limit(env) or 0,
         outcomes=_outcomes(env, model, seen_by_monitor),
         starts=starts,
         start_cumulative=np.cumsum(model.initial)[starts],
-        observation=_numbers(observations),
+        observation=numbers,
     )
-
-
-def _numbers(observations: NDArray[Any]) -> NDArray[np.int64]:
-    """Integer observations of all states; other observations are replaced by state numbers."""
-    if np.issubdtype(observations.dtype, np.integer) and observations.ndim == 1:
-        return observations.astype(np.int64)
-    return np.arange(len(observations))
 
 
 def _outcomes(env: Env, model: TransitionModel, seen_by_monitor: TransitionModel) -> NDArray[Any]:

@@ -255,7 +255,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         """Raise ValueError for an exploration without known probabilities, which are needed."""
         if self.exploration == "gaussian_noise":
             raise ValueError(
-                f"{role} needs the probabilities of its actions, which gaussian_noise does not "
+                f"{role} needs the probabilities of the actions, which gaussian_noise does not "
                 "give: take epsilon_greedy or boltzmann"
             )
 
