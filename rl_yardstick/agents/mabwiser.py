@@ -35,12 +35,7 @@ KINDS = {
 
 
 class MABWiserPolicy(TablePolicy):
-    """Holds a `mabwiser.mab.MAB` over arms numbered from 0.
-
-    MABWiser 2.7.4 keeps its state in Python objects, and cannot predict before its first reward.
-    Here the state is saved as one tensor, because a model file contains no pickle, and the caller
-    passes the random number generator.
-    """
+    """Holds a `mabwiser.mab.MAB` over arms numbered from 0, and saves its objects as one tensor."""
 
     def __init__(
         self,
@@ -203,10 +198,7 @@ class MABWiserThompson(MABWiserAgent):
 
 
 class MABWiserLinUCB(MABWiserAgent):
-    """MABWiser's LinUCB, with ``alpha`` standard deviations and a ridge of 1.
-
-    Contexts that are numbers become one-hot.
-    """
+    """MABWiser's LinUCB, with ``alpha`` standard deviations and a ridge of 1."""
 
     kind = "LinUCB"
     ranges = {"alpha": NOT_NEGATIVE}  # noqa: RUF012

@@ -42,7 +42,10 @@ def _merged(owners: list[Any]) -> dict[str, inspect.Parameter]:
     """The arguments of the first constructor, and for ``**kwargs`` those of the others."""
     if owners[0] is object:
         return {}
-    own = _parameters(owners[0])
+    try:
+        own = inspect.signature(owners[0].__init__, eval_str=True).parameters.values()
+    except NameError:  # annotations that only a type checker can resolve
+        own = inspect.signature(owners[0].__init__).parameters.values()
     starred = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     merged = {p.name: p for p in own if p.name != "self" and p.kind not in starred}
     if any(p.kind is p.VAR_KEYWORD for p in own):
@@ -50,13 +53,6 @@ def _merged(owners: list[Any]) -> dict[str, inspect.Parameter]:
         passed_on = _merged(owners[1:]).items()
         merged = {**{n: p for n, p in passed_on if n not in hidden}, **merged}
     return merged
-
-
-def _parameters(owner: Any) -> list[inspect.Parameter]:
-    try:
-        return list(inspect.signature(owner.__init__, eval_str=True).parameters.values())
-    except NameError:  # annotations that only a type checker can resolve
-        return list(inspect.signature(owner.__init__).parameters.values())
 
 
 # Step sizes: how far an estimate moves towards its target.

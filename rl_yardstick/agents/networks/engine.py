@@ -178,7 +178,13 @@ class SharedOptimizer:
         kind, _ = _kind(self.optimizer)
         remembered = [parameter for parameter in self.parameters if parameter in known]
         for parameter in remembered:
-            known[parameter] = _own_memory(known[parameter], kind)
+            state = dict(known[parameter])
+            for name, value in state.items():
+                if isinstance(value, th.Tensor):
+                    state[name] = value.clone(memory_format=th.contiguous_format)
+            if kind == RMSPROP_TENSORFLOW:
+                state["step"] = int(state["step"])
+            known[parameter] = state
         if not any(known[parameter]["step"] for parameter in remembered):
             known.clear()
 
@@ -190,19 +196,6 @@ def in_rows(state: Any) -> Any:
         copied.update({name: in_rows(value) for name, value in state.items()})
         return copied
     return state.contiguous() if isinstance(state, th.Tensor) else state
-
-
-def _own_memory(state: dict[str, Any], kind: int) -> dict[str, Any]:
-    """A copy of an optimizer's state of a parameter, in PyTorch's memory layout."""
-    copied = {
-        name: value.clone(memory_format=th.contiguous_format)
-        if isinstance(value, th.Tensor)
-        else value
-        for name, value in state.items()
-    }
-    if kind == RMSPROP_TENSORFLOW:
-        copied["step"] = int(copied["step"])
-    return copied
 
 
 def _kind(optimizer: th.optim.Optimizer) -> tuple[int, tuple[str, ...]]:

@@ -11,7 +11,6 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import Schedule, TrainFrequencyUnit
 from stable_baselines3.common.utils import update_learning_rate
-from stable_baselines3.common.vec_env import VecNormalize
 
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.exploration import first_best
@@ -462,6 +461,15 @@ class QTraining(NetworkTraining):
         agent = self.agent
         buffer = agent.replay_buffer
         n_steps = buffer.n_steps if type(buffer) is NStepReplayBuffer else 1
+        normalising: dict[str, Any] = {}
+        if (env := agent.get_vec_normalize_env()) is not None:
+            normalising = {
+                "normalises_observations": env.norm_obs,
+                "clip_obs": env.clip_obs,
+                "normalises_rewards": env.norm_reward,
+                "reward_spread": np.sqrt(env.ret_rms.var + env.epsilon),
+                "clip_reward": env.clip_reward,
+            }
         return record_of(
             RULES,
             gamma=agent.gamma,
@@ -476,7 +484,7 @@ class QTraining(NetworkTraining):
             counts_episodes=agent.train_freq.unit == TrainFrequencyUnit.EPISODE,
             gradient_steps=agent.gradient_steps,
             target_interval=max(agent.target_update_interval // agent.n_envs, 1),
-            **normalising_rules(agent.get_vec_normalize_env()),
+            **normalising,
         )
 
     def _replay(self) -> Replay:
@@ -591,19 +599,6 @@ class QTraining(NetworkTraining):
         agent.logger.record("train/loss", place["losses"] / place["n_losses"])
         agent.logger.record("train/learning_rate", float(place["learning_rate"]))
         update_learning_rate(agent.policy.optimizer, float(place["learning_rate"]))
-
-
-def normalising_rules(env: VecNormalize | None) -> dict[str, Any]:
-    """The settings of VecNormalize, as fields of a record of `RULES`."""
-    if env is None:
-        return {}
-    return {
-        "normalises_observations": env.norm_obs,
-        "clip_obs": env.clip_obs,
-        "normalises_rewards": env.norm_reward,
-        "reward_spread": np.sqrt(env.ret_rms.var + env.epsilon),
-        "clip_reward": env.clip_reward,
-    }
 
 
 class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
