@@ -256,7 +256,8 @@ def canonical_policy(model: TransitionModel, policy: Policy) -> Policy:
             raise ValueError(f"the policy takes an action outside 0..{model.n_actions - 1}")
         if len(actions) > 1:
             return actions
-        return np.eye(model.n_actions)[np.clip(actions[0], 0, model.n_actions - 1)]
+        stationary: Floats = np.eye(model.n_actions)[np.clip(actions[0], 0, model.n_actions - 1)]
+        return stationary
     matrix = policy.astype(np.float64)
     total = matrix.sum(axis=1)
     # Written so that a NaN fails.

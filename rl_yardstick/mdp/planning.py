@@ -310,7 +310,7 @@ class PlanningProblem:
         if discount == 1:
             return cls(model, float(discount), finite_part(model, allowed))
         none = np.zeros_like(allowed)
-        part = FinitePart(model.reachable, allowed, none.any(axis=1), none, 0.0)
+        part = FinitePart(model.reachable, allowed, np.zeros_like(model.reachable), none, 0.0)
         return cls(model, float(discount), part)
 
     @cached_property
