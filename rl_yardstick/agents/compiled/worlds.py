@@ -22,7 +22,7 @@ from rl_yardstick.envs.known_models import (
     time_limit,
     transition_model,
 )
-from rl_yardstick.envs.model_claims import is_trusted
+from rl_yardstick.envs.checking import is_trusted
 from rl_yardstick.envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,

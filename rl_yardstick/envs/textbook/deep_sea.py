@@ -52,10 +52,7 @@ class DeepSeaEnv(MapEnv):
 
     ## Information
     `reset` and `step` give nothing more. Each draws one uniform number; a step whose reward is
-    drawn, then a standard normal one.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake. Random rewards are given by their means;
-    the arrays hold their variance too.
+    drawn, then a standard normal one. The model has the means of random rewards, and their variance.
 
     ## Arguments
     - `size=10`: number of rows and of columns

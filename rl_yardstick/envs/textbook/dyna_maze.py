@@ -88,9 +88,6 @@ class DynaMazeEnv(GridWorld):
     or the edge) and `is_success` (whether it stands on the goal).
     `action_masks()` tells which moves do not run into a wall or the edge; with `slip` it considers
     the intended move.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake; with `change_after_steps` they are those
-    of the moment.
 
     ## Arguments
     - `maze="dyna"`: or `"blocking"` or `"shortcut"`
