@@ -60,7 +60,7 @@ class Claim:
         if isinstance(base, OWN_CLASSES):
             return base.transition_model()
         if isinstance(base, BlackjackEnv):
-            return blackjack_model(base)
+            return blackjack_model(bool(base.natural), bool(base.sab))
         P = base.get_wrapper_attr("P")  # noqa: N806 (Gymnasium's own name)
         return TransitionModel.from_gymnasium(P, base.get_wrapper_attr("initial_state_distrib"))
 
@@ -93,7 +93,7 @@ def claim_of(base: Env) -> Claim | None:
     if not brings_model:
         return None
     claim = Claim(base)
-    if is_trusted(base):
+    if isinstance(base, OWN_CLASSES) and is_trusted(base):
         return claim
     try:
         model, actions, observations = claim.model, base.action_space, claim.observations

@@ -272,7 +272,12 @@ class GridRenderer(Renderer):
             first, last = (self._centre(cell) for cell in sorted(step))
             line = pygame.Rect(first, (last[0] - first[0], last[1] - first[1]))
             picture.fill(BLUE, line.inflate(width, width))
-        self._put_robot(picture, scene)
+        row, column = scene.place(scene.robot)
+        if self.rows[row][column] == "M":
+            self._put(picture, BURST_SHAPES, scene.robot, self.marker * 3 // 2)
+        robot = self._sprite(ROBOT_SHAPES, self.marker)
+        degrees = {None: 0, 0: 0, 1: 180, 2: 90, 3: 270}[scene.last_move]
+        self._blit(picture, pygame.transform.rotate(robot, degrees), scene.robot)
         longest = max(picture.get_size())
         if longest <= MAX_SIDE:
             return picture
@@ -288,7 +293,12 @@ class GridRenderer(Renderer):
         picture = pygame.Surface(size)
         picture.fill(FLOOR)
         if not self.detailed:
-            pixels = self._colours.repeat(self.cell, axis=0).repeat(self.cell, axis=1)
+            table = np.zeros((128, 3), np.uint8)
+            for letter, colour in LETTER_COLOURS.items():
+                table[ord(letter)] = colour
+            codes = np.frombuffer("".join(self.rows).encode("ascii"), np.uint8)
+            pixels = table[codes.reshape(len(self.rows), self.n_columns)]
+            pixels = pixels.repeat(self.cell, axis=0).repeat(self.cell, axis=1)
             pygame.surfarray.blit_array(picture, pixels.swapaxes(0, 1))
         drawn = LETTER_SHAPES.keys() if self.detailed else {"S", "G"}
         for row, letters in enumerate(self.rows):
@@ -303,25 +313,6 @@ class GridRenderer(Renderer):
             for y in range(self.cell, size[1], self.cell):
                 pygame.draw.line(picture, GRID, (0, y), (size[0], y))
         return picture
-
-    @cached_property
-    def _colours(self) -> NDArray[np.uint8]:
-        """One colour for each cell, shape (rows, columns, 3)."""
-        table = np.zeros((128, 3), np.uint8)
-        for letter, colour in LETTER_COLOURS.items():
-            table[ord(letter)] = colour
-        codes = np.frombuffer("".join(self.rows).encode("ascii"), np.uint8)
-        return table[codes].reshape(len(self.rows), self.n_columns, 3)
-
-    def _put_robot(self, picture: pygame.Surface, scene: Scene) -> None:
-        import pygame
-
-        row, column = scene.place(scene.robot)
-        if self.rows[row][column] == "M":
-            self._put(picture, BURST_SHAPES, scene.robot, self.marker * 3 // 2)
-        robot = self._sprite(ROBOT_SHAPES, self.marker)
-        degrees = {None: 0, 0: 0, 1: 180, 2: 90, 3: 270}[scene.last_move]
-        self._blit(picture, pygame.transform.rotate(robot, degrees), scene.robot)
 
     def _put(
         self, picture: pygame.Surface, shapes: tuple[Shape, ...], cell: int, size: int

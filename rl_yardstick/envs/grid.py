@@ -36,11 +36,37 @@ UNREACHED = -1
 Description = Sequence[str] | str | os.PathLike[str]
 
 
-@dataclass(frozen=True, eq=False)
-class GridMap:
-    """A rectangular map of letters; row 0 is at the top, cells are numbered row by row."""
+@dataclass(frozen=True)
+class Grid:
+    """Rows of letters; row 0 is at the top, cells are numbered row by row."""
 
     rows: tuple[str, ...]
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns."""
+        return len(self.rows[0])
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return self.n_rows * self.n_columns
+
+    def place_name(self, cell: int) -> str:
+        """The name of a cell, rows and columns counted from 1 as on all pages and pictures."""
+        row, column = divmod(cell, self.n_columns)
+        return f"row {row + 1}, column {column + 1}"
+
+
+@dataclass(frozen=True, eq=False)
+class GridMap(Grid):
+    """A map that was checked."""
+
     codes: bytes  # the letters' ASCII codes, one per cell
     start: int  # the cell of the only ``S``
     distances: NDArray[np.int32]  # see `distances_to`, to the nearest goal; shape (cells,)
@@ -71,7 +97,7 @@ class GridMap:
                 raise ValueError(f"{source}: row {i} has {len(row)} cells, row 1 has {n_columns}")
         if not set(letters) <= set(known):
             cell = next(cell for cell, letter in enumerate(letters) if letter not in known)
-            place = f"{letters[cell]!r} at {_place(cell, n_columns)}"
+            place = f"{letters[cell]!r} at {Grid(rows).place_name(cell)}"
             raise ValueError(f"{source}: unknown letter {place}; known are {' '.join(known)}")
         goals = [cell for cell, letter in enumerate(letters) if letter == GOAL]
         if letters.count(START) != 1 or not goals:
@@ -82,25 +108,10 @@ class GridMap:
         distances = distances_to(goals, free.reshape(len(rows), n_columns)).ravel()
         if distances[start] == UNREACHED:
             raise ValueError(
-                f"{source}: the goal at {_place(goals[0], n_columns)} cannot be reached from the "
-                f"start at {_place(start, n_columns)}"
+                f"{source}: the goal at {Grid(rows).place_name(goals[0])} cannot be reached from "
+                f"the start at {Grid(rows).place_name(start)}"
             )
         return cls(rows, codes, start, distances)
-
-    @property
-    def n_rows(self) -> int:
-        """Number of rows."""
-        return len(self.rows)
-
-    @property
-    def n_columns(self) -> int:
-        """Number of columns."""
-        return len(self.rows[0])
-
-    @property
-    def n_cells(self) -> int:
-        """Number of cells."""
-        return len(self.codes)
 
 
 def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
@@ -154,11 +165,6 @@ def read_rows(desc: Description) -> tuple[str, ...]:
 
 def _is_path(desc: Description) -> TypeGuard[str | os.PathLike[str]]:
     return isinstance(desc, os.PathLike) or (isinstance(desc, str) and "\n" not in desc)
-
-
-def _place(cell: int, n_columns: int) -> str:
-    row, column = divmod(cell, n_columns)
-    return f"row {row + 1}, column {column + 1}"
 
 
 MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
@@ -479,7 +485,7 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
 
     def cell_of(self, state: int) -> int:
         """The cell of a state."""
-        return state % self.map.n_cells
+        return state % self.dynamics.n_cells
 
     def transition_model(self) -> TransitionModel:
         """The exact dynamics as arrays; its states are numbered as `s`, whatever is observed."""

@@ -36,8 +36,8 @@ BANDITS = {
 }
 # Entry points in `rl_yardstick.envs`, and time limits.
 FINITE = {
-    "DeepSea-v0": ("textbook.deep_sea:DeepSeaEnv", 1000),
-    "DynaMaze-v0": ("textbook.dyna_maze:DynaMazeEnv", 100),
+    "DeepSea-v0": ("textbook.grids:DeepSeaEnv", 1000),
+    "DynaMaze-v0": ("textbook.grids:DynaMazeEnv", 100),
     "GamblersProblem-v0": ("textbook.dynamic_programming:GamblersProblemEnv", 1000),
     "JacksCarRental-v0": ("textbook.dynamic_programming:JacksCarRentalEnv", 100),
     "MaximizationBias-v0": ("textbook.chains:MaximizationBiasEnv", 100),
@@ -45,7 +45,7 @@ FINITE = {
     "RandomWalk-v0": ("textbook.chains:RandomWalkEnv", 1000),
     "RiverSwim-v0": ("textbook.chains:RiverSwimEnv", 20),
     "ShortCorridor-v0": ("textbook.chains:ShortCorridorEnv", 1000),
-    "WindyGridworld-v0": ("textbook.windy_gridworld:WindyGridworldEnv", 1000),
+    "WindyGridworld-v0": ("textbook.grids:WindyGridworldEnv", 1000),
     "Hallway-v0": ("pomdp:HallwayEnv", 30),
     "Tiger-v0": ("pomdp:TigerEnv", 10),
     "Warehouse-v0": ("warehouse:WarehouseEnv", 1000),

@@ -121,14 +121,11 @@ class IdleActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         P = getattr(env.unwrapped, "P", None)  # noqa: N806 (Gymnasium's own name)
         if P is None:
             raise ValueError(f"IdleActionMasks needs an environment that holds P, not {env}")
-        changes = [
-            [
-                any(p > 0 and (ends or after != s) for p, after, _, ends in P[s][a])
-                for a in range(len(P[s]))
-            ]
-            for s in range(len(P))
-        ]
-        self.masks = np.array(changes)
+        self.masks = np.zeros((len(P), len(P[0])), np.bool_)
+        for state, action in np.ndindex(self.masks.shape):
+            self.masks[state, action] = any(
+                prob > 0 and (ends or after != state) for prob, after, _, ends in P[state][action]
+            )
         self.masks |= ~self.masks.any(axis=1, keepdims=True)
 
     def action_masks(self) -> Bools:
