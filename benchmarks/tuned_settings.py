@@ -102,12 +102,12 @@ def judge_family(algos: list[str], n_seeds: int) -> int:
         spec = _spec(*member, algos[0], 0)
         judge = exact_evaluator(_spec(*member, "qlearning", 0))
         assert judge is not None
-        gamma = spec.hyperparams.algorithm["gamma"]
+        gamma = spec.hyperparams["gamma"]
         plan = policy_iteration(judge.model, gamma)
         worth = policy_return(judge.model, plan.policy, judge.horizon).expected_return
         planned = float(judge.yardstick.score(worth))
         plannable.append(planned >= PLANNABLE)
-        cells = [f"{spec.hyperparams.n_timesteps:,}", f"{gamma:.4f}", f"{planned:.2f}"]
+        cells = [f"{spec.hyperparams['n_timesteps']:,}", f"{gamma:.4f}", f"{planned:.2f}"]
         for algo in algos:
             scores = []
             for seed in seeds:
