@@ -55,18 +55,14 @@ from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.policies import believed_values
 from rl_yardstick.pipeline.spec import TrainSpec
 
-# The largest model to plan in for an agent's objective, which takes about a second.
-MOST_OUTCOMES = 500_000
-# Action values within this of the best, relative to it, count as ties.
-TIE = 1e-9
-# States are named where at most this many of them make up this share of the gap.
-MOST_STATES, MOST_OF_GAP = 3, 0.5
-# The probability of an end from which on it counts as sure.
-SURELY = 0.99
-# Repairs that regain less than this share of the gap are not worth a line.
-WORTH_A_LINE = 0.05
-# Returns within this of each other, relative to them, count as equal.
-ROUNDING = 1e-9
+MOST_OUTCOMES = (
+    500_000  # of a model to plan in for an agent's objective, which takes about a second
+)
+TIE = 1e-9  # action values within this of the best, relative to it, count as ties
+MOST_STATES, MOST_OF_GAP = 3, 0.5  # states are named where these many make up this share of the gap
+SURELY = 0.99  # the probability of an end from which on it counts as sure
+WORTH_A_LINE = 0.05  # repairs that regain less than this share of the gap have no line
+ROUNDING = 1e-9  # returns within this of each other, relative to them, count as equal
 
 
 @dataclass(frozen=True)
@@ -214,21 +210,18 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
 
 def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _Task | None:
     """The agent's objective; None where it is unknown, too large, or of another shape."""
-    discount = getattr(agent, "gamma", None)
+    discount, shape = getattr(agent, "gamma", None), evaluator.model.prob.shape
     if isinstance(agent, PlanningAgent | RandomAgent) or not isinstance(discount, int | float):
         return None
     with closing(make_single_env(spec, training=True)) as env:
         model = transition_model(env)
-    if model is None or model.prob.shape != evaluator.model.prob.shape:
-        return None
-    if model.prob.size > MOST_OUTCOMES:
+    if model is None or model.prob.shape != shape or model.prob.size > MOST_OUTCOMES:
         return None
     epsilon = 0.0
     explores = learns_exploring_values(spec, agent)
     if explores and getattr(agent, "exploration", "") == "epsilon_greedy":
         epsilon = float(getattr(agent, "exploration_rate", 0.0))
-    lived = _noisy(model, epsilon) if epsilon > 0 else model
-    return _Task(model, float(discount), epsilon, lived)
+    return _Task(model, float(discount), epsilon, _noisy(model, epsilon) if epsilon > 0 else model)
 
 
 def _names(env: gym.Env[Any, Any], evaluator: ExactEvaluator) -> _Names:
@@ -355,9 +348,8 @@ class Found:
         task = self.task
         if task is None or self.own_values is None or task.discount >= 1:
             return None
-        best = float(task.lived.initial @ self.own_values.max(axis=1))
-        own = policy_return(task.lived, self.taken, None, task.discount)
-        return max(best - own.expected_return, 0.0)
+        own = policy_return(task.lived, self.taken, None, task.discount).expected_return
+        return max(float(task.lived.initial @ self.own_values.max(axis=1)) - own, 0.0)
 
     # --- on the way -------------------------------------------------------------------------------
 
@@ -508,9 +500,7 @@ def parting(one: Side, other: Side) -> Parting:
 
 def _first_actions(model: TransitionModel, policy: NDArray[Any]) -> Ints:
     """The likeliest action of a policy at the first step, shape (S,)."""
-    canonical = canonical_policy(model, policy)
-    likeliest: Ints = policy_matrix(model, canonical).argmax(axis=1)
-    return likeliest
+    return np.asarray(policy_matrix(model, canonical_policy(model, policy)).argmax(axis=1))
 
 
 def _noisy(model: TransitionModel, epsilon: float) -> TransitionModel:
@@ -524,10 +514,8 @@ def _noisy(model: TransitionModel, epsilon: float) -> TransitionModel:
         random = np.repeat(array.reshape(n_states, 1, -1), n_actions, axis=1)
         return np.concatenate([array, random], axis=2)
 
-    prob = both(model.prob)
-    n_own = model.n_outcomes
-    prob[:, :, :n_own] *= 1 - epsilon
-    prob[:, :, n_own:] *= epsilon / n_actions
-    return TransitionModel(
-        prob, both(model.next_state), both(model.reward), both(model.terminated), model.initial
-    )
+    arrays = (model.prob, model.next_state, model.reward, model.terminated)
+    prob, *others = map(both, arrays)
+    prob[:, :, : model.n_outcomes] *= 1 - epsilon
+    prob[:, :, model.n_outcomes :] *= epsilon / n_actions
+    return TransitionModel(prob, *others, model.initial)

@@ -85,32 +85,21 @@ class Trained(ABC):
 
 
 class Subject(ABC):
-    """An algorithm under audit.
+    """An algorithm under audit."""
 
-    Attributes:
-        typed: settings that the user gave.
-        base: settings that learn tiny worlds, unless the user gave others.
-        steps: environment steps after which values are read first.
-        target: the kind of its targets; None where that is not known.
-        uses_ratio: whether it uses importance sampling, for a greedy target policy.
-        is_on_policy: whether it learns from rollouts, as the library's on-policy agents do.
-        has_values: whether its values can be read.
-        stepwise: settings under which an agent of ours calls its environment at each step.
-        spaces: kinds of observations and actions.
-    """
-
-    typed: Mapping[str, Any]
-    steps = 2000
-    target: Target | None = None
-    uses_ratio = is_on_policy = False
-    has_values = True
-    stepwise: Mapping[str, str] = {}
-    spaces: tuple[Observations, Actions]
+    typed: Mapping[str, Any]  # settings that the user gave
+    steps = 2000  # of the environment, after which values are read first
+    target: Target | None = None  # the kind of its targets; None where that is not known
+    uses_ratio = False  # whether it uses importance sampling, for a greedy target policy
+    is_on_policy = False  # whether it learns from rollouts, as the library's on-policy agents do
+    has_values = True  # whether its values can be read
+    stepwise: Mapping[str, str] = {}  # settings under which ours calls its environment at each step
+    spaces: tuple[Observations, Actions]  # the kinds of observations and actions
     parameters: Mapping[str, inspect.Parameter]
 
     def __init__(self, name: str, kind: str | None) -> None:
         self.name = name
-        self.base: dict[str, Any] = dict(BASE)
+        self.base = dict(BASE)  # settings that learn tiny worlds, unless the user gave others
         if kind is not None:
             self.target = KINDS[kind]
             self.uses_ratio = kind == "off_policy_monte_carlo"
@@ -212,16 +201,13 @@ _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
 
 
 class ClassSubject(Subject):
-    """A subclass of Stable-Baselines3's `BaseAlgorithm`.
+    """A subclass of Stable-Baselines3's `BaseAlgorithm`, an agent of the registry.
 
     Args:
-        name: an agent of the registry, see also `register_class`.
+        name: of the agent; see also `register_class`.
         typed: settings that the user gave.
         kind: what it claims to be, among `KINDS`; None: as its family.
         wanted: kinds of observations and actions; None: the first that works.
-
-    Raises:
-        UserError: if the agent cannot be audited, or a setting is wrong.
     """
 
     def __init__(
@@ -242,7 +228,7 @@ class ClassSubject(Subject):
         for key in typed:
             if key not in known:
                 raise unknown(f"{name} has no hyperparameter", key, known)
-        self._find_family()
+        self._set_family()
         if "=interpreted" in known.get("engine", []) and "engine" not in typed:
             self.stepwise = {"engine": "interpreted"}
         arguments = check_arguments(name, typed)
@@ -250,7 +236,7 @@ class ClassSubject(Subject):
         self.typed = constructor_arguments(spec, self.cls, is_dict=False)
         self.find_spaces(wanted)
 
-    def _find_family(self) -> None:
+    def _set_family(self) -> None:
         """Set the settings that learn tiny worlds fast, and what the family claims to be."""
         from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
         from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -303,11 +289,10 @@ class TrainedModel(Trained):
         env = make_env(world, self.record, *subject.spaces)
         self.model = subject.cls(env=env, **settings)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
-        self._has_begun = False
 
     def train(self, steps: int, callback: BaseCallback | None = None) -> None:
-        self.model.learn(steps, callback=callback, reset_num_timesteps=not self._has_begun)
-        self._has_begun = True
+        is_first = not self.model.num_timesteps
+        self.model.learn(steps, callback=callback, reset_num_timesteps=is_first)
 
     def act(self, state: int) -> int:
         observation = np.asarray(self._env.observation_of(state))
