@@ -329,7 +329,7 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     policy.set_training_mode(False)
     with th.no_grad():
         tensor, _ = policy.obs_to_tensor(batch)
-        if hasattr(policy, "critic"):  # at the actor's action: values of others are not learnt
+        if not hasattr(policy, "lstm_critic"):  # at the actor's action: no others are learnt
             critics = policy.critic(tensor, policy._predict(tensor, deterministic=True))
             critics = th.stack(critics) if isinstance(critics, tuple) else critics.transpose(0, 1)
             means = critics.reshape(len(critics), len(tensor), -1).mean(dim=(0, 2))
