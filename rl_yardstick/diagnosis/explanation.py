@@ -515,7 +515,7 @@ def _noisy(model: TransitionModel, epsilon: float) -> TransitionModel:
         return np.concatenate([array, random], axis=2)
 
     arrays = (model.prob, model.next_state, model.reward, model.terminated)
-    prob, *others = map(both, arrays)
+    prob, next_state, reward, terminated = map(both, arrays)
     prob[:, :, : model.n_outcomes] *= 1 - epsilon
     prob[:, :, model.n_outcomes :] *= epsilon / n_actions
-    return TransitionModel(prob, *others, model.initial)
+    return TransitionModel(prob, next_state, reward, terminated, model.initial)

@@ -176,13 +176,13 @@ _ON_POLICY: Mapping[str, Any] = {
 _QUANTILES = {"policy_kwargs": {"net_arch": [32], "n_quantiles": 10}}
 _LSTM = {"policy_kwargs": {**_ON_POLICY["policy_kwargs"], "lstm_hidden_size": 16}}
 _FOLLOW = ("NStepTreeBackup", "NStepSARSA", "SARSALambda", "SARSA", "ExpectedSARSA")
-_FOLLOW += ("SemiGradientSARSA",)
 _MAXIMISE = ("QLambda", "QLearning", "PrioritizedSweeping", "SemiGradientQ")
 _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
     **dict.fromkeys(_FOLLOW, ("follows", 1000, {})),
     **dict.fromkeys(_MAXIMISE, ("maximises", 1000, {})),
     **dict.fromkeys(("OffPolicyMonteCarlo", "DoubleQLearning"), ("maximises", 2000, {})),
     "OptimisticAlgorithm": ("maximises", 1000, {"bonus_scale": 1e-3, "known_after": 1}),
+    "SemiGradientSARSA": ("follows", 1000, {}),
     "MonteCarlo": ("follows", 1000, {"learning_rate": 0.1}),
     "ActorCritic": ("states", 1000, {}),
     "Reinforce": ("states", 1000, {"baseline": "value"}),

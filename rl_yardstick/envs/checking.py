@@ -214,9 +214,9 @@ class Trial:
     def __init__(self, env: Any, claim: Claim) -> None:
         self.env, self.model, self.n_actions = env, claim.model, claim.model.n_actions
         self.limit = (env.spec and env.spec.max_episode_steps) or EPISODE_LIMIT
-        self.observations = claim.observations
+        self.observations = known = claim.observations
         states = np.arange(self.model.n_states)
-        self.observes_states = np.array_equal(claim.observations, states)
+        self.observes_states = known is not None and np.array_equal(known, states)
         self.prob_of = _outcomes(self.model)
         self.counts: Counter[Observed] = Counter()
         self.n_of_row: Counter[int] = Counter()
