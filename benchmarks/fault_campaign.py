@@ -17,7 +17,6 @@ must be 0.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import random
 import signal
@@ -33,7 +32,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from _campaign_commands import Case, cases
+from _campaigns import Case, cases, send
 
 SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGINT twice")
 TARGETS = ("driver", "worker", "all")
@@ -53,14 +52,18 @@ def disturbed(case: Case, seed: int) -> int:
     logs = case.folder_of(f"disturbed {seed}")
     signals = 0
     for _ in range(MOST_STARTS):
+        process = case.start(logs)
         if signals < MOST_SIGNALS:
-            process, is_stopped = _stop_after_seconds(case, logs, draw)
-            signals += is_stopped
-        else:
-            process = case.start(logs)
+            try:
+                process.wait(draw.uniform(0.0, case.seconds))
+            except subprocess.TimeoutExpired:
+                _disturb(case, process, draw)
+                signals += 1
         code = _ended(case, process)
         case.counts["orphans"] += _orphans(process.pid)
-        case.counts["tracebacks"] += _has_traceback(case)
+        if "Traceback" in case.read_said():
+            case.counts["tracebacks"] += 1
+            print(f"{case.name}:\n{case.said}", file=sys.stderr)
         if code == 0:
             break
     else:
@@ -75,45 +78,27 @@ def _ended(case: Case, process: subprocess.Popen[str]) -> int:
         return process.wait(LONGEST + 20 * case.seconds)
     except subprocess.TimeoutExpired:
         for pid in _group(process.pid):
-            _send(pid, signal.SIGABRT)
+            send(pid, signal.SIGABRT)
         case.counts["never done"] += 1
         process.wait()
         print(f"{case.name} hangs:\n{case.read_said()}", file=sys.stderr)
         return 0
 
 
-def _stop_after_seconds(
-    case: Case, logs: Path, draw: random.Random
-) -> tuple[subprocess.Popen[str], bool]:
-    process = case.start(logs)
-    try:
-        process.wait(draw.uniform(0.0, case.seconds))
-    except subprocess.TimeoutExpired:
-        _disturb(case, process, draw)
-        return process, True
-    return process, False
-
-
 def _disturb(case: Case, process: subprocess.Popen[str], draw: random.Random) -> None:
     how = draw.choice(SIGNALS)
-    target = draw.choice(TARGETS) if case.is_study else "driver"
+    has_workers = case.words[0] == "compare.py" and not case.is_told
+    target = draw.choice(TARGETS) if has_workers else "driver"
     pids = [process.pid] if target == "driver" else _group(process.pid)
     if target == "worker":
-        pids, how = (
-            draw.sample([pid for pid in pids if pid != process.pid] or [process.pid], 1),
-            "SIGKILL",
-        )
+        workers = [pid for pid in pids if pid != process.pid] or [process.pid]
+        pids, how = draw.sample(workers, 1), "SIGKILL"
     case.counts[how] += 1
     for pid in pids:
-        _send(pid, getattr(signal, how.partition(" ")[0]))
+        send(pid, getattr(signal, how.partition(" ")[0]))
     if how == "SIGINT twice":
         time.sleep(draw.uniform(0.0, 1.0))
-        _send(process.pid, signal.SIGINT)
-
-
-def _send(pid: int, number: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, number)
+        send(process.pid, signal.SIGINT)
 
 
 def _group(session: int) -> list[int]:
@@ -135,15 +120,8 @@ def _orphans(session: int) -> int:
     while (left := _group(session)) and time.monotonic() < until:
         time.sleep(0.05)
     for pid in left:
-        _send(pid, signal.SIGKILL)
+        send(pid, signal.SIGKILL)
     return len(left)
-
-
-def _has_traceback(case: Case) -> int:
-    found = "Traceback" in case.read_said()
-    if found:
-        print(f"{case.name}:\n{case.said}", file=sys.stderr)
-    return int(found)
 
 
 def _judge(case: Case, logs: Path) -> None:
@@ -197,7 +175,6 @@ def main() -> int:
         chosen = [case for case in found if case.name in args.only or not args.only]
         signals, seed = 0, 0
         with ThreadPoolExecutor(args.jobs) as pool:
-            list(pool.map(Case.prepare, chosen))
             list(pool.map(Case.run_in_peace, chosen))
             while signals < args.kills:
                 signals += sum(pool.map(partial(disturbed, seed=seed), chosen))

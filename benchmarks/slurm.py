@@ -30,7 +30,7 @@ from typing import Any
 
 import yaml
 
-from _run_contents import contents
+from _campaigns import contents, send
 
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "scancel", "scontrol", "squeue")
@@ -125,7 +125,7 @@ class Slurm:
         self.running[name].wait()
         for job in self.jobs(name) if name in ("n1", "n2") else []:
             for pid in pids_of(job):
-                _kill(pid)
+                send(pid, signal.SIGKILL)
         time.sleep(2)
         self.start(name)
 
@@ -183,13 +183,8 @@ def pids_of(job: str, kind: str = "") -> list[int]:
     return sorted(found)
 
 
-def _kill(pid: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
-
-
-def documented_jobs(folder: Path) -> Path:
-    """The ``slurm.yml`` of docs/cluster.md for these nodes."""
+def documented_jobs(folder: Path) -> None:
+    """Write the ``slurm.yml`` of docs/cluster.md for these nodes."""
     page = (ROOT / "docs/cluster.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```yaml\n(jobqueue:.*?)```", page, re.DOTALL)
     settings: dict[str, Any] = yaml.safe_load(block)
@@ -205,19 +200,11 @@ def documented_jobs(folder: Path) -> Path:
         "job-script-prologue": [],
     }
     (folder / "keys").mkdir(exist_ok=True)
-    path = folder / "slurm.yml"
-    path.write_text(yaml.safe_dump(settings), encoding="utf-8")
-    return path
+    (folder / "slurm.yml").write_text(yaml.safe_dump(settings), encoding="utf-8")
 
 
 class Study:
-    """A command that does a study by SLURM.
-
-    Args:
-        cluster: the SLURM cluster.
-        folder: the working directory of the command.
-        words: arguments of the command.
-    """
+    """A command that does a study by SLURM, in a working directory."""
 
     def __init__(self, cluster: Slurm, folder: Path, words: str) -> None:
         self.cluster, self.folder, self.words = cluster, folder, words
@@ -261,7 +248,7 @@ class Study:
         job = next(iter(cluster.jobs()), "")
         if fault == "worker":
             for pid in pids_of(job, "spawn_main")[:1]:
-                _kill(pid)
+                send(pid, signal.SIGKILL)
             return f"of job {job}"
         if fault == "preempt":
             urgent = ["-p", "urgent", "-N", "1", "--exclusive", "--no-requeue", "-o", "/dev/null"]

@@ -51,19 +51,13 @@ class World:
         self.means = PROBABILITIES if self.coins else self.rng.standard_normal(N_ARMS)
         self.weights = self.rng.standard_normal((N_ARMS, N_FEATURES))
 
-    def pull(self, arm: int) -> float:
-        """A reward of ``arm``."""
+    def pull(self, arm: int, context: Any = None) -> float:
+        """A reward of ``arm``, in a context where one is given."""
+        if context is not None:
+            return float(self.rng.normal(self.weights[arm] @ context))
         if self.coins:
             return float(self.rng.random() < self.means[arm])
         return float(self.rng.normal(self.means[arm]))
-
-    def context(self) -> Any:
-        """The features of a random context."""
-        return self.rng.uniform(-1, 1, N_FEATURES)
-
-    def pull_in(self, arm: int, context: Any) -> float:
-        """A reward of ``arm`` in ``context``."""
-        return float(self.rng.normal(self.weights[arm] @ context))
 
 
 def batch(name: str) -> None:
@@ -107,11 +101,11 @@ def plain_linucb() -> None:
     inverses = np.tile(np.eye(N_FEATURES), (N_ARMS, 1, 1))
     moments = np.zeros((N_ARMS, N_FEATURES))
     for _ in range(PULLS):
-        x = world.context()
+        x = world.rng.uniform(-1, 1, N_FEATURES)
         half = inverses @ x
         means = np.einsum("ad,ad->a", half, moments)
         arm = int(np.argmax(means + np.sqrt(half @ x)))
-        reward = world.pull_in(arm, x)
+        reward = world.pull(arm, x)
         inverses[arm] -= np.outer(half[arm], half[arm]) / (1 + half[arm] @ x)
         moments[arm] += reward * x
 
@@ -127,11 +121,11 @@ def mabwiser(name: str) -> None:
             arm = mab.predict()
             mab.partial_fit([arm], [world.pull(arm)])
         return
-    mab.fit([0], [0.0], world.context()[None])
+    mab.fit([0], [0.0], world.rng.uniform(-1, 1, N_FEATURES)[None])
     for _ in range(PULLS):
-        x = world.context()[None]
+        x = world.rng.uniform(-1, 1, N_FEATURES)[None]
         arm = mab.predict(x)
-        mab.partial_fit([arm], [world.pull_in(arm, x[0])], x)
+        mab.partial_fit([arm], [world.pull(arm, x[0])], x)
 
 
 def rows(folder: Path) -> Rows:

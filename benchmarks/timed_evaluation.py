@@ -27,6 +27,8 @@ from rl_yardstick.pipeline.training import train
 from timing import Benchmark, Contender, Rows
 
 N_STEPS = 20_000
+EVALUATED, CHECKPOINTS = "EvalCallback with log and best model", "CheckpointCallback, ten zips"
+BLOCKS = "BlockCallback every 1,000 steps"
 TRAININGS = (
     "--env CartPole-v1 --algo ppo",
     "--env CartPole-v1 --algo ppo --engine compiled",
@@ -89,11 +91,11 @@ def beside(algo: str, env_id: str, n_envs: int, n_steps: int, name: str) -> floa
     with tempfile.TemporaryDirectory() as folder:
         evaluated = partial(EvalCallback, n_eval_episodes=20, eval_freq=every, verbose=0)
         callbacks: dict[str, Callable[[], BaseCallback]] = {
-            "EvalCallback with log and best model": lambda: evaluated(
+            EVALUATED: lambda: evaluated(
                 environments(algo, env_id, 1), log_path=folder, best_model_save_path=folder
             ),
-            "CheckpointCallback, ten zips": lambda: CheckpointCallback(every, folder),
-            "BlockCallback every 1,000 steps": EachThousand,
+            CHECKPOINTS: lambda: CheckpointCallback(every, folder),
+            BLOCKS: EachThousand,
         }
         settings: dict[str, Any] = {"policy": "MlpPolicy", **PPO} if algo == "ppo" else TABLE
         algorithm: Any = load_algorithm(algo)
@@ -121,13 +123,7 @@ def rows(folder: Path) -> Rows:
         }
         for words in TRAININGS
     }
-    names = (
-        "nothing",
-        "EvalCallback with log and best model",
-        "TensorBoard",
-        "CheckpointCallback, ten zips",
-        "BlockCallback every 1,000 steps",
-    )
+    names = ("nothing", EVALUATED, "TensorBoard", CHECKPOINTS, BLOCKS)
     for training in BESIDE:
         label = f"learn(), {training[0]} compiled, {training[1]}"
         made[label] = {name: partial(beside, *training, name) for name in names}

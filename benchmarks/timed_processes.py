@@ -31,7 +31,7 @@ TESTBED: dict[str, dict[str, Any]] = {
 }
 PPO = "--algo ppo --env CartPole-v1 -n 20000 --num-threads 1"
 EQUAL = "--eval-freq 5000 --eval-episodes 5 --n-eval-envs 1"
-IMPORT = {"import stable_baselines3": ("-c", "import stable_baselines3")}
+IMPORT = "import stable_baselines3"
 
 
 def python(*words: str, program: str = sys.executable) -> float:
@@ -103,8 +103,7 @@ def rows(folder: Path) -> Rows:
             "compare.py --algos qlearning sarsa --env FrozenLake-v1 --seeds 2 -n 1000",
         )
     }
-    alone = {name: partial(python, *words) for name, words in IMPORT.items()}
-    made: Rows = {"commands": {**alone, **commands}}
+    made: Rows = {"commands": {IMPORT: partial(python, "-c", IMPORT), **commands}}
     settings = f"--conf-file {peer_folder('rl_zoo3') / 'hyperparams' / 'ppo.yml'}"
     for name, more in (("defaults", ""), ("equal evaluation", EQUAL)):
         words = f"{PPO} {settings} {more} -f {{folder}}".split()

@@ -112,10 +112,10 @@ def loop_over_gymnasium(env_id: str) -> None:
 
 
 def loop_without_gymnasium(
-    table: Any, argmax: Callable[[Any], int], highest: Callable[[Any], float]
+    make_table: Callable[[], Any], argmax: Callable[[Any], int], highest: Callable[[Any], float]
 ) -> None:
     """The same for the warehouse only; the table is indexed by row, column and action."""
-    grid = [list(row) for row in DEFAULT_MAP]
+    table, grid = make_table(), [list(row) for row in DEFAULT_MAP]
     moves = [(-1, 0), (1, 0), (0, -1), (0, 1)]
     row, column, elapsed = 9, 0, 0
     for _ in range(PYTHON_STEPS):
@@ -135,18 +135,6 @@ def loop_without_gymnasium(
         row, column, elapsed = next_row, next_column, elapsed + 1
         if done or elapsed == 1000:
             row, column, elapsed = 9, 0, 0
-
-
-def loop_with_arrays() -> None:
-    """With a NumPy table, which is most common."""
-    table = np.zeros((10, 10, 4))
-    loop_without_gymnasium(table, lambda values: int(np.argmax(values)), np.max)
-
-
-def loop_with_lists() -> None:
-    """With lists, the fastest variant in plain Python here."""
-    table = [[[0.0] * 4 for _ in range(10)] for _ in range(10)]
-    loop_without_gymnasium(table, lambda values: values.index(max(values)), max)
 
 
 @numba.njit
@@ -263,8 +251,12 @@ def rows(folder: Path) -> Rows:
             "SARSA": ours("sarsa", "interpreted", env_id, folder),
         }
     q_learning = made["Warehouse-v0"]["Q-learning"]
-    for name, loop in (("NumPy", loop_with_arrays), ("lists", loop_with_lists)):
-        plain = speed(loop, PYTHON_STEPS)
+    ways: dict[str, tuple[Any, ...]] = {  # lists are the fastest in plain Python here
+        "NumPy": (lambda: np.zeros((10, 10, 4)), lambda q: int(np.argmax(q)), np.max),
+        "lists": (lambda: np.zeros((10, 10, 4)).tolist(), lambda q: q.index(max(q)), max),
+    }
+    for name, way in ways.items():
+        plain = speed(partial(loop_without_gymnasium, *way), PYTHON_STEPS)
         made[f"Warehouse-v0, by {name} alone"] = {"plain loop": plain, "Q-learning": q_learning}
     for env_id in ENVS[:2]:
         name = env_id.removeprefix("envs:")

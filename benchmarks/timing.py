@@ -55,13 +55,8 @@ class Benchmark:
 
 def speed(work: Callable[[], object], n: int) -> Contender:
     """A contender that does ``n`` steps or pulls, measured per second of processor time."""
-
-    def measure() -> float:
-        started = time.process_time()
-        work()
-        return n / (time.process_time() - started)
-
-    return measure
+    once = seconds(work)
+    return lambda: n / once()
 
 
 def seconds(work: Callable[[], object], repeats: int = 1) -> Contender:

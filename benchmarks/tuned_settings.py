@@ -14,80 +14,63 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 TABULAR = ("qlearning", "sarsa", "expected_sarsa", "double_qlearning")
 
 
-@dataclass(frozen=True)
-class Member:
-    """One environment of the family."""
-
-    env_id: str
-    env_kwargs: dict[str, Any]
-
-
-def _warehouse(**kwargs: Any) -> Member:
-    return Member("Warehouse-v0", kwargs)
-
-
-def _random_warehouse(size: int, map_seed: int, **kwargs: Any) -> Member:
-    return Member("RandomWarehouse-v0", {"size": size, "map_seed": map_seed, **kwargs})
-
-
-def _lake(size: int, seed: int, **kwargs: Any) -> Member:
+def family() -> dict[str, tuple[str, dict[str, Any]]]:
+    """The environments and their arguments, by their names in the table."""
     from gymnasium.envs.toy_text.frozen_lake import generate_random_map
 
-    rows = generate_random_map(size=size, seed=seed)
-    return Member("FrozenLake-v1", {"desc": rows, **kwargs})
-
-
-def _rewards(factor: float, shelf: float) -> dict[str, float]:
-    return {"shelf_reward": shelf * factor, "step_reward": -factor, "goal_reward": 100 * factor}
-
-
-def family() -> dict[str, Member]:
-    """The environments by their names in the table."""
     hall = ["G....#...", ".###.#.#.", ".#.....#.", ".#.###.##", "...#....S", ".#...##.."]
     spiral = ["S....", ".###.", ".#G..", ".####", "....."]
-    return {
-        "Warehouse, slip 0.05": _warehouse(slip=0.05),
-        "slip 0.1": _warehouse(slip=0.1),
-        "slip 0.15": _warehouse(slip=0.15),
-        "slip 0.25": _warehouse(slip=0.25),
-        "shelves -1": _warehouse(shelf_reward=-1),
-        "shelves -1, slip 0.3": _warehouse(shelf_reward=-1, slip=0.3),
-        "shelves -30, slip 0.2": _warehouse(shelf_reward=-30, slip=0.2),
-        "rewards x 0.1, shelves -10, slip 0.2": _warehouse(slip=0.2, **_rewards(0.1, -100)),
-        "own map 6 x 9": _warehouse(desc=hall),
-        "own map 6 x 9, slip 0.1": _warehouse(desc=hall, slip=0.1),
-        "own map 5 x 5, slip 0.2": _warehouse(desc=spiral, slip=0.2),
-        "RandomWarehouse, size 5": _random_warehouse(5, 11),
-        "size 7, slip 0.3": _random_warehouse(7, 12, slip=0.3),
-        "size 10, slip 0.2": _random_warehouse(10, 14, slip=0.2),
-        "size 12, slip 0.1": _random_warehouse(12, 13, slip=0.1),
-        "size 12, slip 0.1, rewards x 10": _random_warehouse(
-            12, 20, slip=0.1, **_rewards(10, -100)
-        ),
-        "size 18, slip 0.2": _random_warehouse(18, 15, slip=0.2),
-        "size 25": _random_warehouse(25, 16),
-        "size 25, slip 0.1, shelves -10": _random_warehouse(25, 17, slip=0.1, shelf_reward=-10),
-        "size 30": _random_warehouse(30, 19),
-        "size 30, slip 0.1": _random_warehouse(30, 18, slip=0.1),
-        "lake 4 x 4, map 11": _lake(4, 11),
-        "lake 4 x 4, map 12": _lake(4, 12),
-        "lake 5 x 5": _lake(5, 13),
-        "lake 5 x 5, rewards x 10": _lake(5, 19, reward_schedule=(10, 0, 0)),
-        "lake 6 x 6": _lake(6, 14),
-        "lake 6 x 6, rewards x 0.1": _lake(6, 20, reward_schedule=(0.1, 0, 0)),
-        "lake 7 x 7": _lake(7, 15),
-        "lake 8 x 8": _lake(8, 16),
-        "lake 8 x 8, not slippery": _lake(8, 17, is_slippery=False),
-        "lake 12 x 12, not slippery": _lake(12, 18, is_slippery=False),
-        "slippery cliff": Member("CliffWalkingSlippery-v1", {}),
+    tenth = {"shelf_reward": -10.0, "step_reward": -0.1, "goal_reward": 10.0}
+    tenfold = {"shelf_reward": -1000, "step_reward": -10, "goal_reward": 1000}
+    warehouses: dict[str, dict[str, Any]] = {
+        "Warehouse, slip 0.05": {"slip": 0.05},
+        "slip 0.1": {"slip": 0.1},
+        "slip 0.15": {"slip": 0.15},
+        "slip 0.25": {"slip": 0.25},
+        "shelves -1": {"shelf_reward": -1},
+        "shelves -1, slip 0.3": {"shelf_reward": -1, "slip": 0.3},
+        "shelves -30, slip 0.2": {"shelf_reward": -30, "slip": 0.2},
+        "rewards x 0.1, shelves -10, slip 0.2": {"slip": 0.2, **tenth},
+        "own map 6 x 9": {"desc": hall},
+        "own map 6 x 9, slip 0.1": {"desc": hall, "slip": 0.1},
+        "own map 5 x 5, slip 0.2": {"desc": spiral, "slip": 0.2},
     }
+    random: dict[str, tuple[int, int, dict[str, Any]]] = {  # size, seed of the map
+        "RandomWarehouse, size 5": (5, 11, {}),
+        "size 7, slip 0.3": (7, 12, {"slip": 0.3}),
+        "size 10, slip 0.2": (10, 14, {"slip": 0.2}),
+        "size 12, slip 0.1": (12, 13, {"slip": 0.1}),
+        "size 12, slip 0.1, rewards x 10": (12, 20, {"slip": 0.1, **tenfold}),
+        "size 18, slip 0.2": (18, 15, {"slip": 0.2}),
+        "size 25": (25, 16, {}),
+        "size 25, slip 0.1, shelves -10": (25, 17, {"slip": 0.1, "shelf_reward": -10}),
+        "size 30": (30, 19, {}),
+        "size 30, slip 0.1": (30, 18, {"slip": 0.1}),
+    }
+    lakes: dict[str, tuple[int, int, dict[str, Any]]] = {
+        "lake 4 x 4, map 11": (4, 11, {}),
+        "lake 4 x 4, map 12": (4, 12, {}),
+        "lake 5 x 5": (5, 13, {}),
+        "lake 5 x 5, rewards x 10": (5, 19, {"reward_schedule": (10, 0, 0)}),
+        "lake 6 x 6": (6, 14, {}),
+        "lake 6 x 6, rewards x 0.1": (6, 20, {"reward_schedule": (0.1, 0, 0)}),
+        "lake 7 x 7": (7, 15, {}),
+        "lake 8 x 8": (8, 16, {}),
+        "lake 8 x 8, not slippery": (8, 17, {"is_slippery": False}),
+        "lake 12 x 12, not slippery": (12, 18, {"is_slippery": False}),
+    }
+    found = {name: ("Warehouse-v0", kwargs) for name, kwargs in warehouses.items()}
+    for name, (size, seed, more) in random.items():
+        found[name] = "RandomWarehouse-v0", {"size": size, "map_seed": seed, **more}
+    for name, (size, seed, more) in lakes.items():
+        rows = generate_random_map(size=size, seed=seed)
+        found[name] = "FrozenLake-v1", {"desc": rows, **more}
+    return {**found, "slippery cliff": ("CliffWalkingSlippery-v1", {})}
 
 
 FIRST_HELD_OUT = 1000
@@ -96,44 +79,19 @@ REACHED = 0.9
 PLANNABLE = 0.95
 
 
-def _spec(member: Member, algo: str, seed: int) -> Any:
+def _spec(env_id: str, env_kwargs: dict[str, Any], algo: str, seed: int) -> Any:
     from rl_yardstick.pipeline.settings import override, read_entry, read_spec
 
-    entry = override(read_entry(algo, member.env_id), {"env_kwargs": member.env_kwargs})
-    return read_spec(algo, member.env_id, entry, seed=seed)
-
-
-@cache
-def _evaluator(name: str) -> Any:
-    from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
-
-    return exact_evaluator(_spec(family()[name], "qlearning", 0))
-
-
-def planning_score(name: str, discount: float) -> float:
-    """The undiscounted score of the best policy under the discount."""
-    from rl_yardstick.mdp import policy_iteration, policy_return
-
-    judge = _evaluator(name)
-    plan = policy_iteration(judge.model, discount)
-    worth = policy_return(judge.model, plan.policy, judge.horizon).expected_return
-    return float(judge.yardstick.score(worth))
-
-
-def family_score(name: str, algo: str, seed: int) -> float:
-    """Train a table in this process; return the exact score of its greedy policy."""
-    from rl_yardstick.pipeline.training import make_agent
-
-    spec = _spec(family()[name], algo, seed)
-    agent: Any = make_agent(spec, None)
-    agent.learn(spec.total_timesteps)
-    agent.env.close()
-    judge = _evaluator(name)
-    return float(judge.yardstick.score(float(judge(agent).returns[0])))
+    entry = override(read_entry(algo, env_id), {"env_kwargs": env_kwargs})
+    return read_spec(algo, env_id, entry, seed=seed)
 
 
 def judge_family(algos: list[str], n_seeds: int) -> int:
     """Print how many seeds of each agent succeed on each member; return the exit code."""
+    from rl_yardstick.mdp import policy_iteration, policy_return
+    from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
+    from rl_yardstick.pipeline.training import make_agent
+
     seeds = range(FIRST_HELD_OUT, FIRST_HELD_OUT + n_seeds)
     reached: dict[str, list[int]] = {algo: [] for algo in algos}
     plannable: list[bool] = []
@@ -141,14 +99,23 @@ def judge_family(algos: list[str], n_seeds: int) -> int:
     print("|---|---|---|---|" + "---|" * len(algos))
     before = time.process_time()
     for name, member in family().items():
-        spec = _spec(member, algos[0], 0)
-        cells = [f"{spec.hyperparams.n_timesteps:,}"]
-        gamma = spec.hyperparams.algorithm["gamma"]
-        planned = planning_score(name, gamma)
+        spec = _spec(*member, algos[0], 0)
+        judge = exact_evaluator(_spec(*member, "qlearning", 0))
+        assert judge is not None
+        gamma = spec.hyperparams["gamma"]
+        plan = policy_iteration(judge.model, gamma)
+        worth = policy_return(judge.model, plan.policy, judge.horizon).expected_return
+        planned = float(judge.yardstick.score(worth))
         plannable.append(planned >= PLANNABLE)
-        cells += [f"{gamma:.4f}", f"{planned:.2f}"]
+        cells = [f"{spec.hyperparams['n_timesteps']:,}", f"{gamma:.4f}", f"{planned:.2f}"]
         for algo in algos:
-            scores = [family_score(name, algo, seed) for seed in seeds]
+            scores = []
+            for seed in seeds:
+                spec = _spec(*member, algo, seed)
+                agent: Any = make_agent(spec, None)
+                agent.learn(spec.total_timesteps)
+                agent.env.close()
+                scores.append(float(judge.yardstick.score(float(judge(agent).returns[0]))))
             n_reached = sum(score >= REACHED for score in scores)
             reached[algo].append(n_reached)
             low = "" if n_reached == n_seeds else f" (lowest {min(scores):.2f})"

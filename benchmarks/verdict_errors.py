@@ -46,7 +46,6 @@ MARGIN, DIFFERENT, TIED = 0.02, 0.04, 0.01  # the level of 5 % in two parts
 SAME, ROUNDING = 1e-12, 1e-9
 SIZES, LOOKS = (3, 5, 10, 20, 30), (10, 20, 40, 80)
 STUDIES = {1: 2000, 7: 500}  # for each figure, by number of environments
-N_PERMUTATIONS = 1000  # of AdaStop; with its default of 10,000 a study takes a minute
 GROWING = ("normal", "one fails in 5%, the other never", "one fails in 10%, the other never")
 WORDS = {"undecided": 0, "better": 1, "worse": -1, "tied": 2}
 
@@ -443,38 +442,6 @@ def growth(scale: float) -> Iterator[str]:
     yield by_size(bank() | some, ((1, 2), (1, 4), (7, 4)), scale, both, (10, 20, 80))
 
 
-def adastop(scale: float) -> Iterator[str]:
-    """Studies that grow, and AdaStop (Mathieu et al., 2023)."""
-    try:
-        from adastop import MultipleAgentsComparator
-    except ImportError:
-        print("The table adastop needs `python -m pip install adastop`.", file=sys.stderr)
-        return
-
-    def words_and_seeds(x: Floats) -> tuple[list[int], Ints]:
-        test = MultipleAgentsComparator(n=10, K=8, B=N_PERMUTATIONS, alpha=0.05, seed=0)
-        going_on, seeds = np.arange(len(x)), np.zeros(len(x), int)
-        while not test.is_finished:
-            seeds[going_on] += 10
-            seen = {k: runs[:n] for k, (runs, n) in enumerate(zip(x, seeds, strict=True))}
-            test.partial_compare(seen, verbose=False)
-            going_on = np.unique(test.current_comparisons)
-        return [{"larger": 1, "smaller": -1, "equal": 0}[w] for w in test.decisions.values()], seeds
-
-    def cell(runs: Runs) -> str:
-        found = zip(*map(words_and_seeds, runs.scores[:, 0]), strict=True)
-        words, seeds = (np.array(each)[:, None] for each in found)
-        return f"{outcome(runs, words, seeds)} / {outcome(runs, *grown(runs.scores))}"
-
-    yield (
-        f"AdaStop (in groups of 10 up to 80 seeds, with {N_PERMUTATIONS} permutations) / studies "
-        f"that grow, on the same {max(int(20 * scale), 3)} studies; figures as in the last table. "
-        "`equal` of AdaStop means that it found no difference, and counts as `undecided`."
-    )
-    sources = {"different agents": bank()["different agents"], "normal": families()["normal"]}
-    yield by_size(sources, ((1, 4),), scale / 100, cell, LOOKS[-1:])
-
-
 # The rows of docs/statistics.md.
 SHOWN = (
     *("different agents: 2 agents, 1 env.", "different agents: 4 agents, 1 env."),
@@ -501,7 +468,7 @@ def shown(part: str) -> str:
 
 def main() -> None:
     """Print the tables."""
-    tables = {each.__name__: each for each in (errors, others, textbook, coverage, growth, adastop)}
+    tables = {each.__name__: each for each in (errors, others, textbook, coverage, growth)}
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("tables", nargs="*", metavar="TABLE", help=", ".join(tables))
     parser.add_argument("--quick", action="store_true", help="a twentieth of the studies")

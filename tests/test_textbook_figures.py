@@ -18,12 +18,12 @@ def as_scripts(monkeypatch):
     """They import each other, as scripts in one folder do."""
     monkeypatch.syspath_prepend(str(FOLDER))
     yield
-    for name in [n for n in sys.modules if n.startswith(("_figures", "figure_"))]:
-        del sys.modules[name]
+    for name in ("_figures", "blackjack", "random_walk"):
+        sys.modules.pop(name, None)
 
 
 def test_true_values_are_those_of_the_model():
-    from _figures import WALK, true_values
+    from random_walk import WALK, true_values
 
     env_kwargs = {"n_states": 19, "left_reward": -1}
     model = transition_model(gym.make(WALK, **env_kwargs))
@@ -32,7 +32,7 @@ def test_true_values_are_those_of_the_model():
 
 
 def test_the_policy_that_sticks_on_twenty_is_worth_what_its_rules_say():
-    from figure_5_1 import exact_values, observations
+    from blackjack import exact_values, observations
 
     values = exact_values()[observations()]
     # Sticking asks for no ace; below 12 are no states of the figure.
@@ -42,12 +42,18 @@ def test_the_policy_that_sticks_on_twenty_is_worth_what_its_rules_say():
     assert (values[0, :-2] < values[1, :-2]).all()
 
 
-def test_what_does_not_hold_is_said(tmp_path, capsys):
-    from _figures import Statement, canvas, finish
+def test_what_does_not_hold_is_said(tmp_path, capsys, monkeypatch):
+    from _figures import Statement, canvas, main
 
-    figure, _ = canvas("t", "x", "y")
-    finish("a", figure, tmp_path, [Statement("it is so", "1", True)])
+    def draw(n_runs):
+        return canvas("t", "x", "y")[0], [Statement("it is so", str(n_runs), n_runs == 1)]
+
+    figures = {"1.1": (draw, 1), "1.2": (draw, 2)}
+    monkeypatch.setattr(sys, "argv", ["", "1.1", "--folder", str(tmp_path)])
+    main("", figures)
+    monkeypatch.setattr(sys, "argv", ["", "--folder", str(tmp_path)])
     with pytest.raises(SystemExit, match="1"):
-        finish("b", figure, tmp_path, [Statement("it is so", "2", False)])
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
+        main("", figures)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["figure_1_1.png", "figure_1_2.png"]
     assert "no" in capsys.readouterr().out

@@ -99,24 +99,19 @@ def audit(
             continue
         found: list[Finding | None] = []
         for lab in labs:
-            found.append(_finding(probe, lab))
+            try:
+                found.append(probe(lab))
+            except NotSettled as error:
+                found.append(Finding("unsaid", str(error)))
+            except UserError:
+                raise
+            except Exception as error:  # noqa: BLE001 (user code may raise anything)
+                text = f"it cannot train here: {type(error).__name__}: {one_line(error)}"
+                found.append(Finding("unsaid", text))
             if found[0] is None or found[0].state in ("ok", "skipped"):
                 break
         if (agreed := _most_agreed(found)) is not None:
             yield replace(agreed, probe=PROBES.get(probe, probe.__name__))
-
-
-def _finding(probe: Probe, lab: Lab) -> Finding | None:
-    """The finding of a probe with one seed; "unsaid" where the probe fails."""
-    try:
-        return probe(lab)
-    except NotSettled as error:
-        return Finding("unsaid", str(error))
-    except UserError:
-        raise
-    except Exception as error:  # noqa: BLE001 (user code may raise anything)
-        text = f"{type(error).__name__}: {one_line(error)}"
-        return Finding("unsaid", f"it cannot train here: {text}")
 
 
 def _most_agreed(found: list[Finding | None]) -> Finding | None:

@@ -19,9 +19,10 @@ A part says where the return is lost, not why. `diagnosis.proposals` says what m
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -41,13 +42,9 @@ from rl_yardstick.mdp import (
     policy_return,
     state_values,
 )
+from rl_yardstick.mdp.advantages import expected_next
 from rl_yardstick.mdp.evaluation import canonical_policy, policy_matrix
-from rl_yardstick.mdp.gaps import (
-    GapByState,
-    first_differences,
-    gap_by_state,
-    greedy_repairs,
-)
+from rl_yardstick.mdp.gaps import GapByState, first_differences, gap_by_state, greedy_repairs
 from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.environments import make_single_env
@@ -58,18 +55,14 @@ from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.policies import believed_values
 from rl_yardstick.pipeline.spec import TrainSpec
 
-# The largest model to plan in for an agent's objective, which takes about a second.
-MOST_OUTCOMES = 500_000
-# Action values within this of the best, relative to it, count as ties.
-TIE = 1e-9
-# States are named where at most this many of them make up this share of the gap.
-MOST_STATES, MOST_OF_GAP = 3, 0.5
-# The probability of an end from which on it counts as sure.
-SURELY = 0.99
-# Repairs that regain less than this share of the gap are not worth a line.
-WORTH_A_LINE = 0.05
-# Returns within this of each other, relative to them, count as equal.
-ROUNDING = 1e-9
+MOST_OUTCOMES = (
+    500_000  # of a model to plan in for an agent's objective, which takes about a second
+)
+TIE = 1e-9  # action values within this of the best, relative to it, count as ties
+MOST_STATES, MOST_OF_GAP = 3, 0.5  # states are named where these many make up this share of the gap
+SURELY = 0.99  # the probability of an end from which on it counts as sure
+WORTH_A_LINE = 0.05  # repairs that regain less than this share of the gap have no line
+ROUNDING = 1e-9  # returns within this of each other, relative to them, count as equal
 
 
 @dataclass(frozen=True)
@@ -154,6 +147,9 @@ class Explanation:
         }
 
 
+_Names = tuple[Callable[[int], str], tuple[str, ...]]
+
+
 class _Task(NamedTuple):
     """The objective that the agent was trained for."""
 
@@ -195,56 +191,44 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
     task = _task(spec, agent, evaluator)
     found = Found(evaluator, agent, policy, split, task)
     with closing(make_single_env(spec)) as env:
-        words = _Words(env, evaluator)
-        alike = None if found.groups is None else found.alike(words)
+        names = _names(env, evaluator)
+        alike = None if found.groups is None else found.alike(names)
         explained = replace(
             explained,
             parts=found.parts(),
-            states=found.states(words),
-            repairs=() if alike else found.repairs(words),
+            states=found.states(names),
+            repairs=() if alike else found.repairs(names),
             discount=None if task is None else task.discount,
             own_gap=found.own_gap(),
             is_caught=found.is_caught(),
             looks_alike=alike is not None,
         )
         if alike is not None or not explained.is_concentrated:
-            explained = replace(explained, road=alike or found.road(words))
+            explained = replace(explained, road=alike or found.road(names))
     return replace(explained, proposals=proposals(spec, found, explained.parts))
 
 
 def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _Task | None:
     """The agent's objective; None where it is unknown, too large, or of another shape."""
-    discount = getattr(agent, "gamma", None)
+    discount, shape = getattr(agent, "gamma", None), evaluator.model.prob.shape
     if isinstance(agent, PlanningAgent | RandomAgent) or not isinstance(discount, int | float):
         return None
     with closing(make_single_env(spec, training=True)) as env:
         model = transition_model(env)
-    if model is None or model.prob.shape != evaluator.model.prob.shape:
-        return None
-    if model.prob.size > MOST_OUTCOMES:
+    if model is None or model.prob.shape != shape or model.prob.size > MOST_OUTCOMES:
         return None
     epsilon = 0.0
     explores = learns_exploring_values(spec, agent)
     if explores and getattr(agent, "exploration", "") == "epsilon_greedy":
         epsilon = float(getattr(agent, "exploration_rate", 0.0))
-    lived = _noisy(model, epsilon) if epsilon > 0 else model
-    return _Task(model, float(discount), epsilon, lived)
+    return _Task(model, float(discount), epsilon, _noisy(model, epsilon) if epsilon > 0 else model)
 
 
-class _Words:
-    """Names of states and actions."""
-
-    def __init__(self, env: gym.Env[Any, Any], evaluator: ExactEvaluator) -> None:
-        self._env, self._layout = env, evaluator.layout
-        self._actions = action_names(env)
-
-    def place(self, state: int) -> str:
-        """The name of a state."""
-        return state_name(self._env, self._layout, state)
-
-    def action(self, action: int) -> str:
-        """The name of an action."""
-        return self._actions[action] if action < len(self._actions) else f"action {action}"
+def _names(env: gym.Env[Any, Any], evaluator: ExactEvaluator) -> _Names:
+    """The function from a state to its name, and the names of all actions."""
+    known = action_names(env)
+    more = (f"action {action}" for action in range(len(known), evaluator.model.n_actions))
+    return partial(state_name, env, evaluator.layout), (*known, *more)
 
 
 class Found:
@@ -259,13 +243,18 @@ class Found:
         task: _Task | None,
     ) -> None:
         self.evaluator, self.split, self.task, self.policy = evaluator, split, task, policy
-        self.model, self.horizon = evaluator.model, evaluator.horizon
-        self.agent, self.taken = agent, _first_actions(evaluator.model, policy, evaluator.horizon)
+        self.model, self.horizon, self.agent = evaluator.model, evaluator.horizon, agent
+        self.taken = _first_actions(self.model, policy)
         self.groups = None
         if evaluator.scale is not None:
             self.groups = observation_groups(evaluator.observations, self.model.reachable)
         self.beliefs = believed_values(agent, evaluator.observations)
-        self.updates = _updates(agent, evaluator.observations)
+        # how often each pair of state and action of a table was updated, shape (S, A)
+        self.updates: Ints | None = None
+        counts = getattr(agent.policy, "visit_counts", None)
+        if counts is not None and evaluator.observations.ndim == 1:
+            summed: Ints = counts.numpy().sum(axis=0)[evaluator.observations]
+            self.updates = summed if summed.any() else None
         # optimal action values for its discount, and of its own objective, shape (S, A)
         self.for_discount: Floats | None = None
         self.own_values: Floats | None = None
@@ -280,58 +269,49 @@ class Found:
 
     def parts(self) -> tuple[Part, ...]:
         """The handicaps between the optimum and the agent, in their order."""
-        task = self.task
+        task, scale = self.task, self.evaluator.scale
         if task is None or self.for_discount is None or self.own_values is None:
             return ()
-        found: list[Part] = []
-        reached = self.split.optimum
-
-        def down_to(value: float, name: str, meaning: str) -> None:
-            nonlocal reached
-            # A policy that is worse than the agent itself makes no part.
-            if value >= self.split.value - ROUNDING * max(1.0, abs(value)):
-                found.append(Part(name, reached - value, meaning))
-                reached = value
-
-        best = self.best_of(self.for_discount)
-        known = f"the best policy for discount {task.discount:g} returns {best:.4g}"
-        down_to(best, "objective", known)
+        # The part that leads to each policy, its return, and what it is.
+        told = f"the best policy for discount {task.discount:g}"
+        policies = [("objective", self.best_of(self.for_discount), told)]
         if task.epsilon > 0:
-            best = self.best_of(self.own_values)
             told = f"the best policy that explores with epsilon {task.epsilon:g}"
-            down_to(best, "exploring", f"{told} returns {best:.4g}")
-        if self.groups is not None:
-            best_seen = None if self.evaluator.scale is None else self.evaluator.scale.best
-            if best_seen is not None:
-                is_best = best_seen.lower == best_seen.upper
-                told = f"the best memoryless policy{'' if is_best else ' found'}"
-                told += f" returns {best_seen.lower:.4g}"
-                down_to(best_seen.lower, "not observable", told)
-        elif self.beliefs is not None:
-            self._of_values(down_to, task)
-        has_values = self.groups is None and self.beliefs is not None
-        looked = any(part.name == "not settled" for part in found)
-        last = "look-ahead" if looked else "not settled" if has_values else "learning"
-        down_to(self.split.value, last, f"the agent itself returns {self.split.value:.4g}")
-        return tuple(found)
+            policies.append(("exploring", self.best_of(self.own_values), told))
+        if scale is not None and scale.best is not None:
+            told = "the best memoryless policy"
+            told += "" if scale.best.lower == scale.best.upper else " found"
+            policies.append(("not observable", scale.best.lower, told))
+        last = "learning"
+        if self.groups is None and self.beliefs is not None:
+            policies += self._of_values(task, self.beliefs)
+            last = "not settled"
+        found, reached, own = [], self.split.optimum, self.split.value
+        for name, value, meaning in policies:
+            # A policy that is worse than the agent itself makes no part.
+            if value >= own - ROUNDING * max(1.0, abs(value)):
+                found.append(Part(name, reached - value, f"{meaning} returns {value:.4g}"))
+                reached = value
+        if any(part.name == "not settled" for part in found):
+            last = "look-ahead"
+        return (*found, Part(last, reached - own, f"the agent itself returns {own:.4g}"))
 
-    def _of_values(self, down_to: Any, task: _Task) -> None:
-        """The parts of an agent that has values for each state."""
-        assert self.beliefs is not None
+    def _of_values(self, task: _Task, beliefs: Floats) -> Iterator[tuple[str, float, str]]:
+        """The policies of an agent that has values for each state."""
         if self.updates is not None:
-            planned = self._planned_on_tried(task.lived, task.discount)
             n_tried = int((self.updates > 0)[self.model.reachable].sum())
             n_pairs = int(self.model.reachable.sum()) * self.model.n_actions
             told = f"planning on the {n_tried:,} of {n_pairs:,} pairs that it tried"
-            down_to(planned, "never tried", f"{told} returns {planned:.4g}")
-        values = self.beliefs if self.beliefs.ndim == 1 else self.beliefs.max(axis=1)
-        if task.epsilon > 0 and self.beliefs.ndim == 2:
-            values = (1 - task.epsilon) * values + task.epsilon * self.beliefs.mean(axis=1)
-        ahead = _looked_ahead(task.model, task.discount, values)
+            planned = self._planned_on_tried(task.lived, task.discount, self.updates > 0, beliefs)
+            yield "never tried", planned, told
+        values = beliefs if beliefs.ndim == 1 else beliefs.max(axis=1)
+        if task.epsilon > 0 and beliefs.ndim == 2:
+            values = (1 - task.epsilon) * values + task.epsilon * beliefs.mean(axis=1)
+        ahead = task.model.expected_reward + task.discount * expected_next(task.model, values)
         if self.evaluator.masks is not None:
             ahead = np.where(self.evaluator.masks, ahead, -np.inf)
-        seen = self._worth(ahead.argmax(axis=1))
-        down_to(seen, "not settled", f"one exact look ahead with its own values returns {seen:.4g}")
+        seen = policy_return(self.model, ahead.argmax(axis=1), self.horizon).expected_return
+        yield "not settled", seen, "one exact look ahead with its own values"
 
     def best_of(self, values: Floats) -> float:
         """The return of the best policy whose actions are all greedy in some values (S, A)."""
@@ -339,23 +319,19 @@ class Found:
         greedy = values >= top - TIE * np.maximum(1.0, np.abs(top))
         return finite_horizon_optimum(self.model, self.horizon, mask=greedy).start_value
 
-    def _worth(self, policy: Ints) -> float:
-        return policy_return(self.model, policy, self.horizon).expected_return
-
-    def _planned_on_tried(self, model: TransitionModel, discount: float) -> float:
-        """The return of the best policy that takes only tried actions.
+    def _planned_on_tried(
+        self, model: TransitionModel, discount: float, tried: Bools, beliefs: Floats
+    ) -> float:
+        """The return of the best policy that takes only tried actions, bool of shape (S, A).
 
         In states without a tried action, the agent's own value and action are kept.
         """
-        assert self.updates is not None
-        assert self.beliefs is not None
-        tried: Bools = self.updates > 0
         if self.evaluator.masks is not None:
-            tried &= self.evaluator.masks
+            tried = tried & self.evaluator.masks
         unknown: Bools = np.asarray(~tried.any(axis=1))
-        ends = model.terminated | unknown[:, None, None]
-        values = self.beliefs if self.beliefs.ndim == 1 else self.beliefs.max(axis=1)
+        values = beliefs if beliefs.ndim == 1 else beliefs.max(axis=1)
         reward = np.where(unknown[:, None, None], values[:, None, None], model.reward)
+        ends = model.terminated | unknown[:, None, None]
         known = replace(model, terminated=ends, reward=reward, reward_variance=None)
         try:
             plan = policy_iteration(known, discount, mask=tried | unknown[:, None])
@@ -372,9 +348,8 @@ class Found:
         task = self.task
         if task is None or self.own_values is None or task.discount >= 1:
             return None
-        best = float(task.lived.initial @ self.own_values.max(axis=1))
-        own = policy_return(task.lived, self.taken, None, task.discount)
-        return max(best - own.expected_return, 0.0)
+        own = policy_return(task.lived, self.taken, None, task.discount).expected_return
+        return max(float(task.lived.initial @ self.own_values.max(axis=1)) - own, 0.0)
 
     # --- on the way -------------------------------------------------------------------------------
 
@@ -391,54 +366,41 @@ class Found:
 
     # --- by state ---------------------------------------------------------------------------------
 
-    def states(self, words: _Words, most: int = 20) -> tuple[StateLoss, ...]:
-        """The states that lose most, the worst first."""
-        losses = self.split.losses
-        order = np.argsort(-losses, kind="stable")[:most]
-        return tuple(self._state(int(state), words) for state in order if losses[state] > 0)
+    def states(self, names: _Names) -> tuple[StateLoss, ...]:
+        """The 20 states that lose most, the worst first."""
+        (place, actions), split, found = names, self.split, []
+        for state in np.argsort(-split.losses, kind="stable")[:20].tolist():
+            pair = [int(self.taken[state]), int(split.action_values[state].argmax())]
+            own = [
+                None if t is None or t.ndim != 2 or self.groups is not None else t[state, pair]
+                for t in (self.beliefs, self.own_values, self.updates)
+            ]
+            known = [None if two is None else tuple(two.tolist()) for two in own]
+            loss, visits = float(split.losses[state]), float(split.visits[state])
+            does, best = (actions[action] for action in pair)
+            found.append(StateLoss(state, place(state), loss, visits, does, best, *known))
+        return tuple(one for one in found if one.loss > 0)
 
-    def _state(self, state: int, words: _Words) -> StateLoss:
-        split = self.split
-        pair = [int(self.taken[state]), int(split.action_values[state].argmax())]
-
-        def of(table: NDArray[Any] | None) -> tuple[Any, Any] | None:
-            if table is None or table.ndim != 2 or self.groups is not None:
-                return None
-            first, second = table[state, pair].tolist()
-            return first, second
-
-        return StateLoss(
-            state=state,
-            name=words.place(state),
-            loss=float(split.losses[state]),
-            visits=float(split.visits[state]),
-            action=words.action(pair[0]),
-            best=words.action(pair[1]),
-            believed=of(self.beliefs),
-            true=of(self.own_values),
-            updates=of(self.updates),
-        )
-
-    def repairs(self, words: _Words) -> tuple[tuple[str, float], ...]:
+    def repairs(self, names: _Names) -> tuple[tuple[str, float], ...]:
         """The greedy repairs that each regain a share of the gap that is worth a line."""
         found = greedy_repairs(self.model, self.policy, self.horizon, self.split, MOST_STATES)
         reached = [self.split.value, *(repair.value for repair in found)]
         too_little = np.diff(reached) < WORTH_A_LINE * self.split.gap
         n_kept = int(too_little.argmax()) if too_little.any() else len(found)
-        return tuple((words.place(repair.state), repair.value) for repair in found[:n_kept])
+        return tuple((names[0](repair.state), repair.value) for repair in found[:n_kept])
 
-    def alike(self, words: _Words) -> str:
+    def alike(self, names: _Names) -> str:
         """The states of the observation that the agent sees most, where several states share it."""
         assert self.groups is not None
         visits = np.bincount(self.groups, self.split.visits)
         counts = np.bincount(self.groups, self.model.reachable)
         most = np.where(counts > 1, visits, -1.0).argmax()
         states = np.flatnonzero((self.groups == most) & self.model.reachable)
-        names = "; ".join(words.place(int(state)) for state in states[:MOST_STATES])
+        places = "; ".join(map(names[0], states[:MOST_STATES].tolist()))
         more = f" and {len(states) - MOST_STATES} more" if len(states) > MOST_STATES else ""
-        return f"it cannot tell {len(states)} states apart: {names}{more}"
+        return f"it cannot tell {len(states)} states apart: {places}{more}"
 
-    def road(self, words: _Words) -> str:
+    def road(self, names: _Names) -> str:
         """How many states of the best road lead the agent to the end, and its last wrong turn.
 
         The road follows the likeliest outcomes of `direct` from the likeliest start.
@@ -465,10 +427,10 @@ class Found:
         if not wrong:
             return ""
         n_sure, last = int((reached[road] > SURELY).sum()), wrong[-1]
-        does, best = (words.action(int(policy[last])) for policy in (taken, planned))
+        does, best = (names[1][policy[last]] for policy in (taken, planned))
         return (
             f"on the best road of {len(road)} states it reaches the end from {n_sure}; its last "
-            f"wrong turn is at {words.place(last)}: {does}, where {best} is best"
+            f"wrong turn is at {names[0](last)}: {does}, where {best} is best"
         )
 
 
@@ -525,50 +487,20 @@ def parting(one: Side, other: Side) -> Parting:
         found = first_differences(model, policies[better], policies[worse], horizon)
     except ValueError as error:
         raise UserError(f"{one[0].env_id}: {error}") from error
-    taken = [_first_actions(model, policies[side], horizon) for side in (better, worse)]
-    order = np.argsort(-np.abs(found.gains), kind="stable")[:20]
+    first, second = (_first_actions(model, policies[side]) for side in (better, worse))
+    places, order = [], np.argsort(-np.abs(found.gains), kind="stable")[:20]
     with closing(make_single_env(one[0])) as env:
-        words = _Words(env, evaluator)
-        places = [
-            Place(
-                state=int(state),
-                name=words.place(int(state)),
-                met=float(found.met[state]),
-                gain=float(found.gains[state]),
-                actions=(words.action(int(taken[0][state])), words.action(int(taken[1][state]))),
-            )
-            for state in order
-            if found.met[state] > 0
-        ]
-    return Parting(
-        names=(names[better], names[worse]),
-        difference=returns[better] - returns[worse],
-        met=float(found.met.sum()),
-        places=tuple(places),
-    )
+        place, actions = _names(env, evaluator)
+        for state in order[found.met[order] > 0].tolist():
+            done, met = (actions[first[state]], actions[second[state]]), float(found.met[state])
+            places.append(Place(state, place(state), met, float(found.gains[state]), done))
+    difference = returns[better] - returns[worse]
+    return Parting((names[better], names[worse]), difference, float(found.met.sum()), tuple(places))
 
 
-def _first_actions(model: TransitionModel, policy: NDArray[Any], horizon: int) -> Ints:
+def _first_actions(model: TransitionModel, policy: NDArray[Any]) -> Ints:
     """The likeliest action of a policy at the first step, shape (S,)."""
-    canonical = canonical_policy(model, policy)
-    likeliest: Ints = policy_matrix(model, canonical).argmax(axis=1)
-    return likeliest
-
-
-def _updates(agent: BaseAlgorithm, observations: NDArray[Any]) -> Ints | None:
-    """How often each pair of state and action was updated, shape (S, A), of agents with tables."""
-    counts = getattr(agent.policy, "visit_counts", None)
-    if counts is None or observations.ndim != 1:
-        return None
-    summed: Ints = counts.numpy().sum(axis=0)[observations]
-    return summed if summed.any() else None
-
-
-def _looked_ahead(model: TransitionModel, discount: float, values: Floats) -> Floats:
-    """Action values (S, A) by one exact step from values (S,)."""
-    following = np.where(model.terminated, 0.0, values[model.next_state])
-    later: Floats = np.einsum("sak,sak->sa", model.prob, following)
-    return model.expected_reward + discount * later
+    return np.asarray(policy_matrix(model, canonical_policy(model, policy)).argmax(axis=1))
 
 
 def _noisy(model: TransitionModel, epsilon: float) -> TransitionModel:
@@ -582,10 +514,8 @@ def _noisy(model: TransitionModel, epsilon: float) -> TransitionModel:
         random = np.repeat(array.reshape(n_states, 1, -1), n_actions, axis=1)
         return np.concatenate([array, random], axis=2)
 
-    prob = both(model.prob)
-    n_own = model.n_outcomes
-    prob[:, :, :n_own] *= 1 - epsilon
-    prob[:, :, n_own:] *= epsilon / n_actions
-    return TransitionModel(
-        prob, both(model.next_state), both(model.reward), both(model.terminated), model.initial
-    )
+    arrays = (model.prob, model.next_state, model.reward, model.terminated)
+    prob, next_state, reward, terminated = map(both, arrays)
+    prob[:, :, : model.n_outcomes] *= 1 - epsilon
+    prob[:, :, model.n_outcomes :] *= epsilon / n_actions
+    return TransitionModel(prob, next_state, reward, terminated, model.initial)

@@ -15,7 +15,6 @@ from rl_yardstick.mdp.transition_model import Floats
 
 Observations = Literal["discrete", "box"]
 Actions = Literal["discrete", "box"]
-Outcomes = list[tuple[float, int, float, bool]]
 
 N_ACTIONS = 2
 
@@ -145,19 +144,17 @@ class ModelledProbeEnv(ProbeEnv):
     @property
     def initial_state_distrib(self) -> Floats:
         """All episodes begin in state 0."""
-        start: Floats = np.eye(self.n_observations)[0]
-        return start
+        return np.asarray(np.eye(self.n_observations)[0])
 
     @property
-    def P(self) -> dict[int, dict[int, Outcomes]]:  # noqa: N802 (Gymnasium's name)
+    def P(self) -> dict[int, dict[int, list[Any]]]:  # noqa: N802 (Gymnasium's name)
         """Lists of (probability, next observation, reward, terminated)."""
         n = self.world.n_states
-        end: Outcomes = [(1.0, n, 0.0, True)]
-        outcomes = {n: dict.fromkeys(range(N_ACTIONS), end)}
+        outcomes = {n: {action: [(1.0, n, 0.0, True)] for action in range(N_ACTIONS)}}
         for state, pays in enumerate(self.world.pays):
             following, terminated = self.world.following(state)
             quits = self.world.quits if state == 0 else 0.0
-            early: Outcomes = [(quits, n, 0.0, True)] if quits else []
+            early = [(quits, n, 0.0, True)] if quits else []
             outcomes[state] = {
                 action: [(1 - quits, following, pay, terminated), *early]
                 for action, pay in enumerate(pays)

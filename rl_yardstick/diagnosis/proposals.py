@@ -135,7 +135,9 @@ class _Case:
             yield from self._step_size(self.rates)
         yield from self._exploration()
         yield from self._objective()
-        own, usual = (_policy_kwargs(one) for one in (self.own, self.usual))
+        given = [one.get("policy_kwargs") or {} for one in (self.own, self.usual)]
+        given = [literal(one) if isinstance(one, str) else one for one in given]
+        own, usual = ({"net_arch": [64, 64], **one} for one in given)
         widths, wide = own["net_arch"], usual["net_arch"]
         is_plain = all(isinstance(one, list) for one in (widths, wide))
         if self.is_network and is_plain and all(isinstance(one, int) for one in widths + wide):
@@ -320,10 +322,10 @@ def _distance(own: Any, usual: Any) -> float:
     if one is None or other is None:
         return 0.0 if own == usual else 1.0
     a, b = float(one.mean()), float(other.mean())
+    if min(a, b) < 0 or a == b:
+        return float(np.sign(a - b))
     least = max(a, b) * 1e-3  # for zeros
-    return float(
-        np.sign(a - b) if min(a, b) < 0 or a == b else np.log(max(a, least) / max(b, least))
-    )
+    return float(np.log(max(a, least) / max(b, least)))
 
 
 def _scaled(value: Any, factor: float, most: float = np.inf) -> Any:
@@ -338,9 +340,3 @@ def _text(value: Any) -> str:
     """A value as ``--test`` takes it, without spaces."""
     is_short = isinstance(value, float) and float(f"{value:g}") == value
     return "null" if value is None else f"{value:g}" if is_short else str(value).replace(" ", "")
-
-
-def _policy_kwargs(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of a network's policy, with the widths of its hidden layers."""
-    value = settings.get("policy_kwargs") or {}
-    return {"net_arch": [64, 64], **(literal(value) if isinstance(value, str) else value)}

@@ -60,10 +60,6 @@ class Trained(ABC):
         self.world, self.record = world, Record(world.n_states)
         self._env = ProbeEnv(world, self.record, *spaces)
 
-    def observation(self, state: int) -> Any:
-        """The observation of a state."""
-        return self._env.observation_of(state)
-
     @abstractmethod
     def act(self, state: int) -> int:
         """The action in a state when evaluated."""
@@ -76,11 +72,12 @@ class Trained(ABC):
     def train(self, steps: int) -> None:
         """Train for that many more steps."""
 
-    def state_values(self) -> Floats | None:
+    def state_values(self) -> Floats:
         """State values, shape (S,): action values are averaged over the actions taken."""
         values = self.values()
-        if values is None or values.shape[1] == 1:
-            return None if values is None else values[:, 0]
+        assert values is not None
+        if values.shape[1] == 1:
+            return values[:, 0]
         counts = self.record.counts()
         weights = np.where(counts.sum(axis=1, keepdims=True) > 0, counts, 1)
         means: Floats = np.average(values, axis=1, weights=weights)
@@ -88,32 +85,21 @@ class Trained(ABC):
 
 
 class Subject(ABC):
-    """An algorithm under audit.
+    """An algorithm under audit."""
 
-    Attributes:
-        typed: settings that the user gave.
-        base: settings that learn tiny worlds, unless the user gave others.
-        steps: environment steps after which values are read first.
-        target: the kind of its targets; None where that is not known.
-        uses_ratio: whether it uses importance sampling, for a greedy target policy.
-        is_on_policy: whether it learns from rollouts, as the library's on-policy agents do.
-        has_values: whether its values can be read.
-        stepwise: settings under which an agent of ours calls its environment at each step.
-        spaces: kinds of observations and actions.
-    """
-
-    typed: Mapping[str, Any]
-    steps = 2000
-    target: Target | None = None
-    uses_ratio = is_on_policy = False
-    has_values = True
-    stepwise: Mapping[str, str] = {}
-    spaces: tuple[Observations, Actions]
+    typed: Mapping[str, Any]  # settings that the user gave
+    steps = 2000  # of the environment, after which values are read first
+    target: Target | None = None  # the kind of its targets; None where that is not known
+    uses_ratio = False  # whether it uses importance sampling, for a greedy target policy
+    is_on_policy = False  # whether it learns from rollouts, as the library's on-policy agents do
+    has_values = True  # whether its values can be read
+    stepwise: Mapping[str, str] = {}  # settings under which ours calls its environment at each step
+    spaces: tuple[Observations, Actions]  # the kinds of observations and actions
     parameters: Mapping[str, inspect.Parameter]
 
     def __init__(self, name: str, kind: str | None) -> None:
         self.name = name
-        self.base: dict[str, Any] = dict(BASE)
+        self.base = dict(BASE)  # settings that learn tiny worlds, unless the user gave others
         if kind is not None:
             self.target = KINDS[kind]
             self.uses_ratio = kind == "off_policy_monte_carlo"
@@ -164,8 +150,8 @@ class Subject(ABC):
 
 # --- classes --------------------------------------------------------------------------------------
 
-# Families of the library and of ours, subclasses before base classes: kind of target, steps, and
-# settings that learn tiny worlds fast. Rates are constant, and exploration is full.
+# Families of the library and of ours: kind of target, steps, and settings that learn tiny worlds
+# fast. Rates are constant, and exploration is full.
 _NET: Mapping[str, Any] = {"policy_kwargs": {"net_arch": [32]}}
 _OFF_POLICY: Mapping[str, Any] = {
     "learning_rate": 3e-3,
@@ -189,27 +175,19 @@ _ON_POLICY: Mapping[str, Any] = {
 }
 _QUANTILES = {"policy_kwargs": {"net_arch": [32], "n_quantiles": 10}}
 _LSTM = {"policy_kwargs": {**_ON_POLICY["policy_kwargs"], "lstm_hidden_size": 16}}
+_FOLLOW = ("NStepTreeBackup", "NStepSARSA", "SARSALambda", "SARSA", "ExpectedSARSA")
+_MAXIMISE = ("QLambda", "QLearning", "PrioritizedSweeping", "SemiGradientQ")
 _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
+    **dict.fromkeys(_FOLLOW, ("follows", 1000, {})),
+    **dict.fromkeys(_MAXIMISE, ("maximises", 1000, {})),
+    **dict.fromkeys(("OffPolicyMonteCarlo", "DoubleQLearning"), ("maximises", 2000, {})),
     "OptimisticAlgorithm": ("maximises", 1000, {"bonus_scale": 1e-3, "known_after": 1}),
-    "RMax": ("maximises", 1000, {"known_after": 1}),
-    "OffPolicyMonteCarlo": ("maximises", 2000, {}),
-    "MonteCarlo": ("follows", 1000, {"learning_rate": 0.1}),
-    "NStepTreeBackup": ("follows", 1000, {}),
-    "NStepSARSA": ("follows", 1000, {}),
-    "SARSALambda": ("follows", 1000, {}),
-    "QLambda": ("maximises", 1000, {}),
-    "SARSA": ("follows", 1000, {}),
-    "ExpectedSARSA": ("follows", 1000, {}),
-    "QLearning": ("maximises", 1000, {}),
-    "DoubleQLearning": ("maximises", 2000, {}),
-    "PrioritizedSweeping": ("maximises", 1000, {}),
     "SemiGradientSARSA": ("follows", 1000, {}),
-    "SemiGradientQ": ("maximises", 1000, {}),
+    "MonteCarlo": ("follows", 1000, {"learning_rate": 0.1}),
     "ActorCritic": ("states", 1000, {}),
     "Reinforce": ("states", 1000, {"baseline": "value"}),
     "QRDQN": ("maximises", 250, {**_OFF_POLICY, **_QUANTILES}),
     "DQN": ("maximises", 250, _OFF_POLICY),
-    "DeepQLearning": ("maximises", 250, {**_OFF_POLICY, "learning_rate": 1e-3}),
     "TQC": (None, 250, {**_ACTOR, "top_quantiles_to_drop_per_net": 0, **_NET}),
     "CrossQ": (None, 1000, _ACTOR),
     "SAC": (None, 250, _ACTOR),
@@ -223,16 +201,13 @@ _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
 
 
 class ClassSubject(Subject):
-    """A subclass of Stable-Baselines3's `BaseAlgorithm`.
+    """A subclass of Stable-Baselines3's `BaseAlgorithm`, an agent of the registry.
 
     Args:
-        name: an agent of the registry, see also `register_class`.
+        name: of the agent; see also `register_class`.
         typed: settings that the user gave.
         kind: what it claims to be, among `KINDS`; None: as its family.
         wanted: kinds of observations and actions; None: the first that works.
-
-    Raises:
-        UserError: if the agent cannot be audited, or a setting is wrong.
     """
 
     def __init__(
@@ -253,7 +228,7 @@ class ClassSubject(Subject):
         for key in typed:
             if key not in known:
                 raise unknown(f"{name} has no hyperparameter", key, known)
-        self._find_family()
+        self._set_family()
         if "=interpreted" in known.get("engine", []) and "engine" not in typed:
             self.stepwise = {"engine": "interpreted"}
         arguments = check_arguments(name, typed)
@@ -261,12 +236,13 @@ class ClassSubject(Subject):
         self.typed = constructor_arguments(spec, self.cls, is_dict=False)
         self.find_spaces(wanted)
 
-    def _find_family(self) -> None:
+    def _set_family(self) -> None:
         """Set the settings that learn tiny worlds fast, and what the family claims to be."""
         from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
         from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-        family = next((name for name in _FAMILIES if self.descends_from(name)), None)
+        names = (ancestor.__name__ for ancestor in self.cls.__mro__)
+        family = next((name for name in names if name in _FAMILIES), None)
         if family is not None:
             target, self.steps, settings = _FAMILIES[family]
             self.base |= settings
@@ -313,33 +289,31 @@ class TrainedModel(Trained):
         env = make_env(world, self.record, *subject.spaces)
         self.model = subject.cls(env=env, **settings)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
-        self._has_begun = False
 
     def train(self, steps: int, callback: BaseCallback | None = None) -> None:
-        self.model.learn(steps, callback=callback, reset_num_timesteps=not self._has_begun)
-        self._has_begun = True
+        is_first = not self.model.num_timesteps
+        self.model.learn(steps, callback=callback, reset_num_timesteps=is_first)
 
     def act(self, state: int) -> int:
-        observation = np.asarray(self.observation(state))
+        observation = np.asarray(self._env.observation_of(state))
         action, _ = self.model.predict(observation, deterministic=True)
         return action_number(action, self._env.action_space)
 
     def drawn_actions(self, state: int, n: int) -> Floats:
         """Actions as they are drawn in training, numbers of shape (n,)."""
-        observations = np.stack([np.asarray(self.observation(state))] * n)
+        observations = np.stack([np.asarray(self._env.observation_of(state))] * n)
         actions, _ = self.model.predict(observations, deterministic=False)
         return np.asarray(actions, dtype=np.float64).reshape(n)
 
     def values(self) -> Floats | None:
         states = range(self.world.n_states)
-        return values_of(self.model, [np.asarray(self.observation(s)) for s in states])
+        return values_of(self.model, [np.asarray(self._env.observation_of(s)) for s in states])
 
 
 def values_of(model: Any, observations: list[Any]) -> Floats | None:
     """A model's values at observations, shape (n, 2) or (n, 1); None where it has none."""
     import torch as th
 
-    from rl_yardstick.agents.linear.algorithm import TileAlgorithm
     from rl_yardstick.pipeline.evaluation.critics import own_values
 
     policy, batch = model.policy, np.stack(observations)
@@ -347,52 +321,25 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
         if isinstance(table := getattr(holder, "q_table", None), np.ndarray) and batch.ndim == 1:
             values: Floats = np.asarray(table, dtype=np.float64)[batch]
             return values
-    if isinstance(model, TileAlgorithm):
+    if callable(getattr(model, "values", None)):
+        return np.stack([np.atleast_1d(model.values(obs)) for obs in observations]).astype(float)
+    if not (hasattr(policy, "lstm_critic") or hasattr(policy, "critic")):
         found = own_values(model, batch)
         return None if found is None else found.reshape(len(batch), -1)
-    if _takes_one_argument(getattr(model, "values", None)):
-        return np.stack([np.atleast_1d(model.values(obs)) for obs in observations]).astype(float)
-    if not hasattr(policy, "obs_to_tensor"):
-        return None
     policy.set_training_mode(False)
     with th.no_grad():
         tensor, _ = policy.obs_to_tensor(batch)
-        told = _network_values(model, policy, tensor)
-    return None if told is None else np.asarray(told.double().numpy())
-
-
-def _takes_one_argument(function: Any) -> bool:
-    """Whether a user's method can be called with an observation alone."""
-    try:
-        inspect.signature(function).bind(None)
-    except (TypeError, ValueError):
-        return False
-    return True
-
-
-def _network_values(model: Any, policy: Any, tensor: Any) -> Any:
-    """Values of networks, a tensor of shape (n, 2) or (n, 1); None where there are none."""
-    import torch as th
-
-    for holder in (model, policy):
-        if hasattr(holder, "q_net"):
-            return holder.q_net(tensor)
-        if hasattr(holder, "quantile_net"):
-            return holder.quantile_net(tensor).mean(dim=1)
-    if hasattr(policy, "lstm_critic"):  # each state after those that lead to it
-        values, shape = [], (policy.lstm_critic or policy.lstm_actor)
-        for last in range(len(tensor)):
+        if not hasattr(policy, "lstm_critic"):  # at the actor's action: no others are learnt
+            critics = policy.critic(tensor, policy._predict(tensor, deterministic=True))
+            critics = th.stack(critics) if isinstance(critics, tuple) else critics.transpose(0, 1)
+            means = critics.reshape(len(critics), len(tensor), -1).mean(dim=(0, 2))
+            return np.asarray(means.double().numpy())[:, None]
+        told, shape = [], (policy.lstm_critic or policy.lstm_actor)
+        for last in range(len(tensor)):  # each state after those that lead to it
             start = th.zeros(shape.num_layers, 1, shape.hidden_size)
-            begins = th.zeros(last + 1)
-            begins[0] = 1
-            sequence = policy.predict_values(tensor[: last + 1], (start, start.clone()), begins)
-            values.append(sequence[-1])
-        return th.stack(values)
-    if hasattr(policy, "critic"):  # at the actor's action: values of other actions are not learnt
-        critics = policy.critic(tensor, policy._predict(tensor, deterministic=True))
-        critics = th.stack(critics) if isinstance(critics, tuple) else critics.transpose(0, 1)
-        return critics.reshape(len(critics), len(tensor), -1).mean(dim=(0, 2))[:, None]
-    return policy.predict_values(tensor) if hasattr(policy, "value_net") else None
+            begins = th.eye(1, last + 1)[0]
+            told.append(policy.predict_values(tensor[: last + 1], (start, start), begins)[-1])
+    return np.asarray(th.stack(told).double().numpy())
 
 
 # --- single files ---------------------------------------------------------------------------------
@@ -462,12 +409,14 @@ class TrainedScript(Trained):
             raise UserError(f"{self.subject.name} must return something with act(obs)")
 
     def act(self, state: int) -> int:
-        return action_number(self.agent.act(self.observation(state)), self._env.action_space)
+        return action_number(
+            self.agent.act(self._env.observation_of(state)), self._env.action_space
+        )
 
     def values(self) -> Floats | None:
         if not callable(getattr(self.agent, "values", None)):
             return None
-        found = [self.agent.values(self.observation(s)) for s in range(self.world.n_states)]
+        found = [self.agent.values(self._env.observation_of(s)) for s in range(self.world.n_states)]
         return np.stack([np.asarray(each, dtype=np.float64).reshape(-1) for each in found])
 
 
@@ -500,30 +449,22 @@ class Lab:
         Raises:
             NotSettled: if they go on changing.
         """
+        most = self.subject.steps * 2**MOST_DOUBLINGS
         known = {**self.subject.base, **self.subject.typed}
         changes = {name: value for name, value in changes.items() if known.get(name) != value}
         key = world, tuple(sorted(changes.items()))
-        most = self.subject.steps * 2**MOST_DOUBLINGS
         if key not in self._values:
-            self._values[key] = self._settle(world, most, changes)
-        values = self._values[key]
-        if values is None:
+            trained = self.begin(world, **changes)
+            steps, values = self.subject.steps, trained.state_values()
+            self._values[key] = None
+            while self._values[key] is None and np.isfinite(values).all() and steps < most:
+                trained.train(steps)
+                before, steps, values = values, 2 * steps, trained.state_values()
+                if np.abs(values - before).max() <= 0.05 * max(1.0, np.abs(values).max()):
+                    self._values[key] = values
+        if (found := self._values[key]) is None:
             raise NotSettled(f"values did not settle within {most:,} steps")
-        return values
-
-    def _settle(self, world: World, most: int, changes: Mapping[str, Any]) -> Floats | None:
-        steps = self.subject.steps
-        trained = self.begin(world, steps, **changes)
-        before = trained.state_values()
-        while before is not None and np.isfinite(before).all() and steps < most:
-            trained.train(steps)
-            steps *= 2
-            values = trained.state_values()
-            assert values is not None
-            if np.abs(values - before).max() <= 0.05 * max(1.0, np.abs(values).max()):
-                return values
-            before = values
-        return None
+        return found
 
     def mean(self, world: World) -> tuple[Floats, float]:
         """Mean values in the second half of training, (S,), and action 1's share in the last state.

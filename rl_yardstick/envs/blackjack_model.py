@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from functools import cache, lru_cache
 
 import numpy as np
-from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
 from rl_yardstick.mdp.transition_model import Floats, Ints, TransitionModel
 
@@ -29,11 +28,6 @@ CARD_PROB = np.array([0.0, *[1 / 13] * 9, 4 / 13])
 CARDS = range(1, 11)
 DEALER_STANDS = 17
 MOST = 21
-
-
-def blackjack_model(env: BlackjackEnv) -> TransitionModel:
-    """The exact dynamics of a Blackjack environment, by its rules `natural` and `sab`."""
-    return _model(bool(env.natural), bool(env.sab))
 
 
 def blackjack_observations() -> Ints:
@@ -88,7 +82,8 @@ def sticking(total: int, dealer: int, natural: str | None) -> tuple[float, float
 
 
 @lru_cache(maxsize=4)
-def _model(pays: bool, sab: bool) -> TransitionModel:
+def blackjack_model(pays: bool, sab: bool) -> TransitionModel:
+    """The exact dynamics of a Blackjack environment, by its rules `natural` and `sab`."""
     shape = (N_STATES, 2, 10)
     prob, reward = np.zeros(shape), np.zeros(shape)
     # Unreachable states, and those of finished games, lead to themselves.

@@ -1,13 +1,14 @@
-"""Precomputed bounds (brackets) of the optimum of Gymnasium's environments, as made by default.
+"""Bounds of the return of any episode, and precomputed ones (brackets) of the optimum.
 
-`benchmarks/optimum_brackets.py` of commit d0af048 wrote them. A bracket applies only to an
-environment of the same class, with the same constants and time limit, whose wrappers change neither
-rewards, actions nor steps.
+`benchmarks/optimum_brackets.py` of commit d0af048 wrote the brackets, for Gymnasium's environments
+as made by default. A bracket applies only to an environment of the same class, with the same
+constants and time limit, whose wrappers change neither rewards, actions nor steps.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,8 +16,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from rl_yardstick.envs.known_models import TRANSPARENT_WRAPPERS, time_limit
-from rl_yardstick.envs.model_claims import is_changed
+from rl_yardstick.envs.checking import is_changed
+from rl_yardstick.envs.known_models import TRANSPARENT_WRAPPERS, time_limit, transition_model
 
 DATA = Path(__file__).with_name("brackets.json")
 
@@ -100,3 +101,34 @@ def is_plain(env: gym.Env[Any, Any]) -> bool:
             return False
         env = env.env
     return not is_changed(env)
+
+
+# The rewards of a step in environments without a transition model, by class.
+_REWARDS = {
+    "gymnasium.envs.classic_control.cartpole.CartPoleEnv": (0.0, 1.0),
+    "gymnasium.envs.classic_control.mountain_car.MountainCarEnv": (-1.0, 0.0),
+    "gymnasium.envs.classic_control.acrobot.AcrobotEnv": (-1.0, 0.0),
+    "gymnasium.envs.classic_control.pendulum.PendulumEnv": (-16.2736044, 0.0),
+}
+
+
+def return_bounds(env: gym.Env[Any, Any]) -> tuple[float, float]:
+    """The least and the greatest return of an episode, infinite where they are not known.
+
+    An environment declares the least and the greatest reward of a step as ``reward_range``. Else
+    they are those of its transition model, or known for its class.
+    """
+    kind, rewards = type(env.unwrapped), (-math.inf, math.inf)
+    declared = getattr(env.unwrapped, "reward_range", None)
+    if isinstance(declared, tuple) and len(declared) == 2:
+        rewards = float(declared[0]), float(declared[1])
+    elif (model := transition_model(env)) is not None:
+        met = model.reward[model.prob > 0]
+        if model.reward_variance is None or not model.reward_variance.any():
+            rewards = float(met.min()), float(met.max())
+    elif is_plain(env):
+        rewards = _REWARDS.get(f"{kind.__module__}.{kind.__qualname__}", rewards)
+    low, high = rewards
+    limit = time_limit(env) or math.inf
+    # An episode has one step at least.
+    return low * limit if low < 0 else low, high * limit if high > 0 else high

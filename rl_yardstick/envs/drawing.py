@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -158,10 +158,10 @@ class Scene:
 
     rows: tuple[str, ...]
     robot: int
-    steps: Collection[tuple[int, int]]  # neighbouring cells that it has gone from and to
-    collected: Collection[int]  # cells that it has emptied
-    last_action: int | None  # 0 up, 1 down, 2 left, 3 right; None before the first
-    title: str | None = None  # above the map as text; None for the latest move
+    steps: Collection[tuple[int, int]] = ()  # neighbouring cells that it has gone from and to
+    collected: Collection[int] = ()  # cells that it has emptied
+    last_move: int | None = None  # 0 up, 1 down, 2 left, 3 right; None before the first
+    title: str = ""  # above the map as text
 
     def place(self, cell: int) -> tuple[int, int]:
         """Row and column of a cell."""
@@ -272,7 +272,12 @@ class GridRenderer(Renderer):
             first, last = (self._centre(cell) for cell in sorted(step))
             line = pygame.Rect(first, (last[0] - first[0], last[1] - first[1]))
             picture.fill(BLUE, line.inflate(width, width))
-        self._put_robot(picture, scene)
+        row, column = scene.place(scene.robot)
+        if self.rows[row][column] == "M":
+            self._put(picture, BURST_SHAPES, scene.robot, self.marker * 3 // 2)
+        robot = self._sprite(ROBOT_SHAPES, self.marker)
+        degrees = {None: 0, 0: 0, 1: 180, 2: 90, 3: 270}[scene.last_move]
+        self._blit(picture, pygame.transform.rotate(robot, degrees), scene.robot)
         longest = max(picture.get_size())
         if longest <= MAX_SIDE:
             return picture
@@ -288,7 +293,12 @@ class GridRenderer(Renderer):
         picture = pygame.Surface(size)
         picture.fill(FLOOR)
         if not self.detailed:
-            pixels = self._colours.repeat(self.cell, axis=0).repeat(self.cell, axis=1)
+            table = np.zeros((128, 3), np.uint8)
+            for letter, colour in LETTER_COLOURS.items():
+                table[ord(letter)] = colour
+            codes = np.frombuffer("".join(self.rows).encode("ascii"), np.uint8)
+            pixels = table[codes.reshape(len(self.rows), self.n_columns)]
+            pixels = pixels.repeat(self.cell, axis=0).repeat(self.cell, axis=1)
             pygame.surfarray.blit_array(picture, pixels.swapaxes(0, 1))
         drawn = LETTER_SHAPES.keys() if self.detailed else {"S", "G"}
         for row, letters in enumerate(self.rows):
@@ -303,25 +313,6 @@ class GridRenderer(Renderer):
             for y in range(self.cell, size[1], self.cell):
                 pygame.draw.line(picture, GRID, (0, y), (size[0], y))
         return picture
-
-    @cached_property
-    def _colours(self) -> NDArray[np.uint8]:
-        """One colour for each cell, shape (rows, columns, 3)."""
-        table = np.zeros((128, 3), np.uint8)
-        for letter, colour in LETTER_COLOURS.items():
-            table[ord(letter)] = colour
-        codes = np.frombuffer("".join(self.rows).encode("ascii"), np.uint8)
-        return table[codes].reshape(len(self.rows), self.n_columns, 3)
-
-    def _put_robot(self, picture: pygame.Surface, scene: Scene) -> None:
-        import pygame
-
-        row, column = scene.place(scene.robot)
-        if self.rows[row][column] == "M":
-            self._put(picture, BURST_SHAPES, scene.robot, self.marker * 3 // 2)
-        robot = self._sprite(ROBOT_SHAPES, self.marker)
-        degrees = {None: 0, 0: 0, 1: 180, 2: 90, 3: 270}[scene.last_action]
-        self._blit(picture, pygame.transform.rotate(robot, degrees), scene.robot)
 
     def _put(
         self, picture: pygame.Surface, shapes: tuple[Shape, ...], cell: int, size: int
@@ -427,6 +418,94 @@ class ShownEnv(gym.Env[Any, Any], ABC):
     def _picture(self) -> Any:
         """The state as the scene that the renderer paints."""
 
-    @abstractmethod
     def _make_renderer(self, fps: int, title: str) -> Renderer:
-        """The renderer of the pictures."""
+        """The renderer of the pictures, charts by default."""
+        return ChartRenderer(fps, title)
+
+
+# --- amounts: the arms of bandits, and states without a map ---------------------------------------
+
+# The length of a bar in a text, in characters.
+LENGTH = 40
+# In pixels.
+WIDTH, MARGIN, TITLE, ROW, TEXT = 560, 24, 48, 44, 20
+
+
+class Bar(NamedTuple):
+    """A named bar from zero to a value."""
+
+    name: str
+    value: float | None  # None for no bar
+    numbers: str  # the same in numbers
+    mark: float | None = None  # a line across the bar
+    is_latest: bool = False  # drawn darker
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Bars on one scale, with a title."""
+
+    title: str
+    bars: list[Bar]
+    low: float  # the lowest value on the scale, at most 0
+    high: float
+
+    @classmethod
+    def fitting(cls, title: str, bars: list[Bar], values: Iterable[float]) -> Bars:
+        """Bars on a scale that includes zero and all values."""
+        known = [0.0, *values]
+        low, high = min(known), max(known)
+        return cls(title, bars, low, high if high > low else low + 1)
+
+    def part(self, value: float) -> float:
+        """0 for the lowest value of the scale, 1 for the highest."""
+        return (value - self.low) / (self.high - self.low)
+
+    def text(self) -> str:
+        """The title on a line, then a line for each bar: ``=`` the bar, ``|`` the mark."""
+        longest = max(len(bar.name) for bar in self.bars)
+        lines = [self.title]
+        for bar in self.bars:
+            cells = [" "] * LENGTH
+            if bar.value is not None:
+                ends = sorted(round(self.part(v) * (LENGTH - 1)) for v in (0.0, bar.value))
+                cells[ends[0] : ends[1] + 1] = "=" * (ends[1] + 1 - ends[0])
+            if bar.mark is not None:
+                cells[round(self.part(bar.mark) * (LENGTH - 1))] = "|"
+            name = f"{'>' if bar.is_latest else ' '} {bar.name:{longest}}"
+            lines.append(f"{name}  {bar.numbers}  {''.join(cells)}".rstrip())
+        return "\n".join(lines) + "\n"
+
+    def chart(self) -> Chart:
+        """The picture: names and numbers above each bar."""
+        length, right = WIDTH - 2 * MARGIN, WIDTH - MARGIN
+        shapes: list[Shape] = [Label(self.title, (MARGIN, TITLE / 2), TEXT + 4, INK, align=0)]
+        for i, bar in enumerate(self.bars):
+            top = TITLE + i * ROW
+            shapes += [
+                Label(bar.name, (MARGIN, top + 8), TEXT, INK, align=0),
+                Label(bar.numbers, (right, top + 8), TEXT, INK, align=1),
+                Box((MARGIN, top + 18), (length, 16), 3, GRID),
+            ]
+            if bar.value is not None:
+                ends = sorted(MARGIN + length * self.part(v) for v in (0.0, bar.value))
+                colour = DARK_BLUE if bar.is_latest else BLUE
+                shapes.append(Box((ends[0], top + 18), (ends[1] - ends[0] + 1, 16), 3, colour))
+            if bar.mark is not None:
+                place = MARGIN + length * self.part(bar.mark)
+                shapes.append(Box((place - 2, top + 15), (4, 22), 2, ORANGE))
+        return Chart((WIDTH, TITLE + ROW * len(self.bars)), shapes)
+
+
+class BarsEnv(ShownEnv):
+    """An environment that is shown as bars."""
+
+    @abstractmethod
+    def _bars(self) -> Bars:
+        """The state as bars."""
+
+    def _text(self) -> str:
+        return self._bars().text()
+
+    def _picture(self) -> Chart:
+        return self._bars().chart()

@@ -20,6 +20,7 @@ Outcome = tuple[float, int, float, bool]
 class FiniteEnv(ShownEnv):
     """An environment with numbered states and actions, whose steps sample from its model.
 
+    The model is there as arrays, `transition_model`, and as ``P`` and ``initial_state_distrib``.
     A subclass defines the dynamics in `transition_model`, and how a state is rendered. `reset` and
     `step` draw one uniform number each, even where nothing is random, and choose by cumulative sum
     in the order of the arrays. Where the model's rewards have a variance, a step then draws a
@@ -114,7 +115,16 @@ class FiniteEnv(ShownEnv):
         ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built on
         first access. Random rewards are given by their means.
         """
-        return as_dictionaries(self.transition_model())
+        model = self.transition_model()
+        columns = model.prob, model.next_state, model.reward, model.terminated
+        states = zip(*(column.tolist() for column in columns), strict=True)
+        return {
+            state: {
+                action: list(zip(*outcomes, strict=True))
+                for action, outcomes in enumerate(zip(*actions, strict=True))
+            }
+            for state, actions in enumerate(states)
+        }
 
 
 class MaskedFiniteEnv(FiniteEnv):
@@ -138,19 +148,6 @@ def first_above(cumulative: Sequence[float] | Floats, uniform: float) -> int:
     """The first index whose sum exceeds the number; 0 where rounding leaves none, as toy_text."""
     place = bisect_right(cumulative, uniform)
     return place if place < len(cumulative) else 0
-
-
-def as_dictionaries(model: TransitionModel) -> dict[int, dict[int, list[Outcome]]]:
-    """A model as Gymnasium's toy_text environments hold it, outcomes of no probability included."""
-    columns = (model.prob, model.next_state, model.reward, model.terminated)
-    states = zip(*(column.tolist() for column in columns), strict=True)
-    return {
-        state: {
-            action: list(zip(*outcomes, strict=True))
-            for action, outcomes in enumerate(zip(*actions, strict=True))
-        }
-        for state, actions in enumerate(states)
-    }
 
 
 def summing_to_one(probabilities: Floats) -> Floats:

@@ -6,7 +6,7 @@ import os
 from abc import abstractmethod
 from array import array
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeGuard
@@ -36,11 +36,37 @@ UNREACHED = -1
 Description = Sequence[str] | str | os.PathLike[str]
 
 
-@dataclass(frozen=True, eq=False)
-class GridMap:
-    """A rectangular map of letters; row 0 is at the top, cells are numbered row by row."""
+@dataclass(frozen=True)
+class Grid:
+    """Rows of letters; row 0 is at the top, cells are numbered row by row."""
 
     rows: tuple[str, ...]
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns."""
+        return len(self.rows[0])
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return self.n_rows * self.n_columns
+
+    def place_name(self, cell: int) -> str:
+        """The name of a cell, rows and columns counted from 1 as on all pages and pictures."""
+        row, column = divmod(cell, self.n_columns)
+        return f"row {row + 1}, column {column + 1}"
+
+
+@dataclass(frozen=True, eq=False)
+class GridMap(Grid):
+    """A map that was checked."""
+
     codes: bytes  # the letters' ASCII codes, one per cell
     start: int  # the cell of the only ``S``
     distances: NDArray[np.int32]  # see `distances_to`, to the nearest goal; shape (cells,)
@@ -71,7 +97,7 @@ class GridMap:
                 raise ValueError(f"{source}: row {i} has {len(row)} cells, row 1 has {n_columns}")
         if not set(letters) <= set(known):
             cell = next(cell for cell, letter in enumerate(letters) if letter not in known)
-            place = f"{letters[cell]!r} at {_place(cell, n_columns)}"
+            place = f"{letters[cell]!r} at {Grid(rows).place_name(cell)}"
             raise ValueError(f"{source}: unknown letter {place}; known are {' '.join(known)}")
         goals = [cell for cell, letter in enumerate(letters) if letter == GOAL]
         if letters.count(START) != 1 or not goals:
@@ -82,25 +108,10 @@ class GridMap:
         distances = distances_to(goals, free.reshape(len(rows), n_columns)).ravel()
         if distances[start] == UNREACHED:
             raise ValueError(
-                f"{source}: the goal at {_place(goals[0], n_columns)} cannot be reached from the "
-                f"start at {_place(start, n_columns)}"
+                f"{source}: the goal at {Grid(rows).place_name(goals[0])} cannot be reached from "
+                f"the start at {Grid(rows).place_name(start)}"
             )
         return cls(rows, codes, start, distances)
-
-    @property
-    def n_rows(self) -> int:
-        """Number of rows."""
-        return len(self.rows)
-
-    @property
-    def n_columns(self) -> int:
-        """Number of columns."""
-        return len(self.rows[0])
-
-    @property
-    def n_cells(self) -> int:
-        """Number of cells."""
-        return len(self.codes)
 
 
 def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
@@ -135,7 +146,11 @@ def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
 def read_rows(desc: Description) -> tuple[str, ...]:
     """The rows of a map, not checked yet; see `GridMap.read`."""
     if _is_path(desc):
-        text = _read_file(Path(desc))
+        try:
+            text = read_file(Path(desc), MAX_MAP_BYTES).decode("utf-8-sig")
+        except (OSError, UnsafeFileError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise ValueError(f"desc: cannot read the map file {desc}: {reason}") from error
     elif isinstance(desc, str):
         text = desc
     elif isinstance(desc, Sequence) and all(isinstance(row, str) for row in desc):
@@ -152,20 +167,6 @@ def _is_path(desc: Description) -> TypeGuard[str | os.PathLike[str]]:
     return isinstance(desc, os.PathLike) or (isinstance(desc, str) and "\n" not in desc)
 
 
-def _read_file(path: Path) -> str:
-    try:
-        return read_file(path, MAX_MAP_BYTES).decode("utf-8-sig")
-    except (OSError, UnsafeFileError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise ValueError(f"desc: cannot read the map file {path}: {reason}") from error
-
-
-def _place(cell: int, n_columns: int) -> str:
-    row, column = divmod(cell, n_columns)
-    return f"row {row + 1}, column {column + 1}"
-
-
-MOVE_NAMES = ("up", "down", "left", "right")
 MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 # For each action the way it is meant to go, then the two ways it may slip.
 POSSIBLE_MOVES = ((0, 2, 3), (1, 2, 3), (2, 0, 1), (3, 0, 1))
@@ -350,17 +351,12 @@ def render_text(scene: Scene) -> str:
     trail = {scene.place(cell) for step in scene.steps for cell in step}
     marks = {(row, column): TRAIL for row, column in trail if scene.rows[row][column] != START}
     marks[robot_row, robot_column] = ROBOT
-    lines = [_title(scene, rows, columns)]
-    lines += ["".join(marks.get((row, c), scene.rows[row][c]) for c in columns) for row in rows]
-    return "\n".join(lines) + "\n"
-
-
-def _title(scene: Scene, rows: range, columns: range) -> str:
-    move = "start" if scene.last_action is None else MOVE_NAMES[scene.last_action]
-    title = f"({move if scene.title is None else scene.title})"
+    title = f"({scene.title})"
     if len(rows) < len(scene.rows) or len(columns) < len(scene.rows[0]):
         title += f" rows {rows[0]}-{rows[-1]}, columns {columns[0]}-{columns[-1]}"
-    return title
+    lines = [title]
+    lines += ["".join(marks.get((row, c), scene.rows[row][c]) for c in columns) for row in rows]
+    return "\n".join(lines) + "\n"
 
 
 def _window(centre: int, length: int, most: int) -> range:
@@ -388,7 +384,7 @@ class MapEnv(FiniteEnv):
 
     def _picture(self) -> Scene:
         name = "start" if self.last_action is None else self.action_names[self.last_action]
-        return Scene(self.rows, self.cell_of(self.s), (), (), None, title=name)
+        return Scene(self.rows, self.cell_of(self.s), title=name)
 
     def _make_renderer(self, fps: int, title: str) -> GridRenderer:
         return GridRenderer(self.rows, fps, title)
@@ -428,6 +424,8 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
     Raises:
         ValueError: if an argument is out of range or the map malformed; see `GridMap.read`.
     """
+
+    action_names: ClassVar[tuple[str, ...]] = ("up", "down", "left", "right")
 
     def __init__(
         self,
@@ -487,7 +485,7 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
 
     def cell_of(self, state: int) -> int:
         """The cell of a state."""
-        return state % self.map.n_cells
+        return state % self.dynamics.n_cells
 
     def transition_model(self) -> TransitionModel:
         """The exact dynamics as arrays; its states are numbered as `s`, whatever is observed."""
@@ -496,9 +494,8 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
     @cached_property
     def initial_state_distrib(self) -> Floats:
         """Probabilities of the starting states, shape (S,)."""
-        starts, thresholds = self._starts
-        distribution = np.zeros(self.dynamics.n_states)
-        distribution[starts] = _equal(len(thresholds))
+        distribution, starts = np.zeros(self.dynamics.n_states), self._starts[0]
+        distribution[starts] = summing_to_one(np.full(len(starts), 1 / len(starts)))
         return distribution
 
     @property
@@ -524,7 +521,7 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
             starts = starts[~np.isin(starts, list(self.dynamics.collectable_bits))]
         else:
             starts = np.array([self.map.start])
-        return starts, np.cumsum(_equal(len(starts)))
+        return starts, np.cumsum(summing_to_one(np.full(len(starts), 1 / len(starts))))
 
     def _info(self) -> dict[str, Any]:
         cell = self.cell_of(self.s)
@@ -536,16 +533,7 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
         }
 
     def _picture(self) -> Scene:
-        collected, cell = divmod(self.s, self.map.n_cells)
-        return Scene(
-            rows=self.map.rows,
-            robot=cell,
-            steps=self._steps,
-            collected=[c for c, bit in self.dynamics.collectable_bits.items() if bit & collected],
-            last_action=self.last_action,
-        )
-
-
-def _equal(n: int) -> Floats:
-    """Equal probabilities."""
-    return summing_to_one(np.full(n, 1 / n))
+        layer = self.s // self.map.n_cells
+        collected = [c for c, bit in self.dynamics.collectable_bits.items() if bit & layer]
+        scene = super()._picture()
+        return replace(scene, steps=self._steps, collected=collected, last_move=self.last_action)

@@ -20,10 +20,9 @@ from gymnasium.envs.toy_text.taxi import TaxiEnv
 from gymnasium.wrappers import ClipReward
 from numpy.typing import NDArray
 
-from rl_yardstick.envs.checking import ModelCheck, checked
-from rl_yardstick.envs.finite_env import MaskedFiniteEnv
+from rl_yardstick.envs.checking import Claim, ModelCheck, checked, claim_of, is_trusted
+from rl_yardstick.envs.finite_env import FiniteEnv, MaskedFiniteEnv
 from rl_yardstick.envs.grid import GOAL, GridWorld
-from rl_yardstick.envs.model_claims import Claim, claim_of, is_trusted
 from rl_yardstick.envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,
@@ -66,7 +65,7 @@ def transition_model(env: Env) -> TransitionModel | None:
     The model is known for this project's grid worlds and textbook environments, its bandits with
     click rates, Gymnasium's FrozenLake, CliffWalking, Taxi and Blackjack, and environments that
     hold ``P`` and ``initial_state_distrib`` as toy_text's do and pass
-    `envs.check_transition_model`. Known wrappers are those that leave the dynamics alone,
+    `envs.checking.check_transition_model`. Known wrappers are those that leave the dynamics alone,
     `ScaleReward`, Gymnasium's `ClipReward` (unless rewards are random), and `TerminationReward`
     where it gives its reward at terminations only. A time limit is no part of the model: see
     `time_limit`. None where the model is not known.
@@ -226,7 +225,9 @@ def _judged(base: Env) -> Judgement:
         return None, ModelCheck(str(error))
     if claim is None:
         return None, None
-    if is_trusted(base):
-        plays = claim.plays_from_model
-        return claim, ModelCheck(None, bit_for_bit=plays, state_can_be_set=plays)
-    return claim, checked(base, claim)
+    if not is_trusted(base):
+        return claim, checked(claim)
+    # Blackjack draws cards, and random rewards have only their means in the model.
+    draws = isinstance(base, FiniteEnv) and claim.model.reward_variance is not None
+    plays = not draws and not isinstance(base, BlackjackEnv)
+    return claim, ModelCheck(None, bit_for_bit=plays, state_can_be_set=plays)

@@ -16,8 +16,8 @@ from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
 
-from rl_yardstick.envs.grid import MOVES, GridWorld, Tile
-from rl_yardstick.envs.textbook.windy_gridworld import WindyGridworldEnv
+from rl_yardstick.envs.grid import MOVES, Grid, GridWorld, Tile
+from rl_yardstick.envs.textbook.grids import WindyGridworldEnv
 from rl_yardstick.mdp.transition_model import Ints
 
 FREE, START, WALL, GOAL, TRAP, PRIZE = ".S#GXP"
@@ -28,7 +28,7 @@ WORDS = {"#": "shelf", "M": "mine", "P": "power"}
 
 
 @dataclass(frozen=True)
-class GridLayout:
+class GridLayout(Grid):
     """The map of a grid world, and how its states are numbered.
 
     State ``cell + n_cells * layer`` is the robot on a cell, cells counted row by row from the top
@@ -36,25 +36,9 @@ class GridLayout:
     there is one layer, 0, and states are cells.
     """
 
-    rows: tuple[str, ...]
     moves: tuple[tuple[int, int], ...]  # rows down, columns to the right: what each action tries
     names: Mapping[str, str]  # what this environment calls its walls, traps and prizes
     prizes: tuple[int, ...] = ()  # their cells
-
-    @property
-    def n_rows(self) -> int:
-        """Number of rows."""
-        return len(self.rows)
-
-    @property
-    def n_columns(self) -> int:
-        """Number of columns."""
-        return len(self.rows[0])
-
-    @property
-    def n_cells(self) -> int:
-        """Number of cells."""
-        return self.n_rows * self.n_columns
 
     @property
     def n_layers(self) -> int:
@@ -86,11 +70,6 @@ class GridLayout:
             )
             for row, letters in enumerate(self.rows)
         )
-
-    def place_name(self, cell: int) -> str:
-        """The name of a cell, rows and columns counted from 1 as on all pages and pictures."""
-        row, column = divmod(cell, self.n_columns)
-        return f"row {row + 1}, column {column + 1}"
 
     def collected_in(self, layer: int) -> tuple[int, ...]:
         """The cells of the prizes that are collected in a layer."""
@@ -157,6 +136,5 @@ def state_name(env: gym.Env[Any, Any], layout: GridLayout | None, state: int) ->
     if isinstance(base, TaxiEnv):
         row, column, passenger, target = base.decode(state)
         where = "on board" if passenger == 4 else f"at {'RGYB'[passenger]}"
-        place = f"row {row + 1}, column {column + 1}"
-        return f"{place}, passenger {where}, to {'RGYB'[target]}"
+        return f"row {row + 1}, column {column + 1}, passenger {where}, to {'RGYB'[target]}"
     return f"state {state}"

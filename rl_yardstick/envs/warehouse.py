@@ -151,9 +151,7 @@ class WarehouseEnv(GridWorld):
     or the outer wall) and `is_success` (whether it stands on the goal).
     `action_masks()` tells which moves do not run into a shelf or the outer wall; with `slip` it
     considers the intended move, and in a cell that is walled in it allows all.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake. States are numbered as the discrete
-    observation is, whatever is observed.
+    States of the model are numbered as the discrete observation is, whatever is observed.
 
     ## Arguments
     - `desc`: the map, as a list of rows or the path to a text file with one row per line
@@ -223,10 +221,8 @@ class WarehouseEnv(GridWorld):
     def _observe(self) -> int | NDArray[np.float32]:
         if self.observation == "discrete":
             return self.s
-        if self.observation == "neighbours":
-            return int(self._neighbours[self.s])
-        observed: NDArray[np.float32] = self.observation_of(np.array([self.s]))[0]
-        return observed
+        observed: Any = self.observation_of(np.array([self.s]))[0]
+        return int(observed) if self.observation == "neighbours" else observed
 
 
 class RandomWarehouseEnv(WarehouseEnv):

@@ -121,20 +121,17 @@ class IdleActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         P = getattr(env.unwrapped, "P", None)  # noqa: N806 (Gymnasium's own name)
         if P is None:
             raise ValueError(f"IdleActionMasks needs an environment that holds P, not {env}")
-        self.masks = np.array(
-            [[_changes(s, P[s][action]) for action in range(len(P[s]))] for s in range(len(P))]
-        )
+        self.masks = np.zeros((len(P), len(P[0])), np.bool_)
+        for state, action in np.ndindex(self.masks.shape):
+            self.masks[state, action] = any(
+                prob > 0 and (ends or after != state) for prob, after, _, ends in P[state][action]
+            )
         self.masks |= ~self.masks.any(axis=1, keepdims=True)
 
     def action_masks(self) -> Bools:
         """The allowed actions now, bool of shape (A,)."""
         base: Any = self.env.unwrapped
         return np.array(self.masks[base.s])
-
-
-def _changes(state: int, outcomes: list[tuple[float, int, float, bool]]) -> bool:
-    """Whether an action can lead to another state or end the episode."""
-    return any(prob > 0 and (ends or after != state) for prob, after, _, ends in outcomes)
 
 
 class ScaleReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):
@@ -200,7 +197,19 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         gym.ObservationWrapper.__init__(self, env)
-        self._sizes, self._first = _sizes_and_starts(env.observation_space)
+        space = env.observation_space
+        parts = space.spaces if isinstance(space, spaces.Tuple) else [space]
+        discrete = [part for part in parts if isinstance(part, spaces.Discrete)]
+        if isinstance(space, spaces.MultiDiscrete):
+            self._sizes, self._first = space.nvec.ravel().tolist(), space.start.ravel().tolist()
+        elif discrete and len(discrete) == len(parts):
+            self._sizes = [int(part.n) for part in discrete]
+            self._first = [int(part.start) for part in discrete]
+        else:
+            raise ValueError(
+                "FlattenToDiscrete needs MultiDiscrete, a Tuple of Discrete, or Discrete, not "
+                f"{space}"
+            )
         self.observation_space = spaces.Discrete(math.prod(self._sizes))
 
     def observation(self, observation: Any) -> int:
@@ -257,18 +266,6 @@ class OneHotObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
         hot = np.zeros((len(batch), self._n), np.float32)
         hot[np.arange(len(batch)), np.asarray(batch) - self._first] = 1
         return hot
-
-
-def _sizes_and_starts(space: spaces.Space[Any]) -> tuple[list[int], list[int]]:
-    if isinstance(space, spaces.MultiDiscrete):
-        return space.nvec.ravel().tolist(), space.start.ravel().tolist()
-    parts = space.spaces if isinstance(space, spaces.Tuple) else [space]
-    discrete = [part for part in parts if isinstance(part, spaces.Discrete)]
-    if not discrete or len(discrete) < len(parts):
-        raise ValueError(
-            f"FlattenToDiscrete needs MultiDiscrete, a Tuple of Discrete, or Discrete, not {space}"
-        )
-    return [int(part.n) for part in discrete], [int(part.start) for part in discrete]
 
 
 class DiscretizeObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):

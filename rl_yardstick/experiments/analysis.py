@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.envs.return_bounds import return_bounds
+from rl_yardstick.envs.brackets import return_bounds
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.pool import do_aside
 from rl_yardstick.experiments.results import StudyResults, values_over_seeds

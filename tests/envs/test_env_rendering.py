@@ -16,8 +16,7 @@ from PIL import Image
 
 from rl_yardstick.envs import drawing
 from rl_yardstick.envs.bandits import BernoulliBandit, GaussianBandit, ReplayBandit
-from rl_yardstick.envs.bars import Bar, Bars
-from rl_yardstick.envs.drawing import ChartRenderer, GridRenderer, Scene
+from rl_yardstick.envs.drawing import Bar, Bars, ChartRenderer, GridRenderer, Scene
 from rl_yardstick.envs.mine_maze import MineMazeEnv
 from rl_yardstick.envs.warehouse import WarehouseEnv
 

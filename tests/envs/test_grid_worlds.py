@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rl_yardstick.envs.grid import GridMap
 from rl_yardstick.envs.mine_maze import MineMazeEnv
-from rl_yardstick.envs.textbook.dyna_maze import DynaMazeEnv
+from rl_yardstick.envs.textbook.grids import DynaMazeEnv
 from rl_yardstick.envs.warehouse import WarehouseEnv, random_warehouse
 
 UP, DOWN, LEFT, RIGHT = range(4)

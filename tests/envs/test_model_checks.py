@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
-from rl_yardstick.envs import check_transition_model, checking
+from rl_yardstick.envs import checking
+from rl_yardstick.envs.checking import check_transition_model
 from rl_yardstick.envs.known_models import (
     model_check,
     observations_of_states,
@@ -57,7 +58,6 @@ def test_right_models_are_believed(name):
     make, bit_for_bit, state_can_be_set = RIGHT[name]
     check = check_transition_model(make(), n_steps=FEW)
     assert check.refusal is None
-    assert check.n_steps > 0.9 * FEW
     assert (check.bit_for_bit, check.state_can_be_set) == (bit_for_bit, state_can_be_set)
 
 

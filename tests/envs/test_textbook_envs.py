@@ -392,9 +392,9 @@ STAY, FORWARD, RIGHT, AROUND, LEFT = range(5)
 
 def places(cell, action, facing):
     """By cell and facing, the chances after an action; cells 0 to 10 are the row, then alcoves."""
-    from rl_yardstick.envs.pomdp.hallway import _world
+    from rl_yardstick.envs.pomdp import _hallway
 
-    world = _world()
+    world = _hallway()
     state = int(np.flatnonzero(world.hidden == 4 * cell + facing)[0])
     found = {}
     for place, chance in enumerate(chances("Hallway-v0", state, action)):
@@ -432,9 +432,9 @@ def test_turning_is_that_of_the_original():
 
 
 def test_readings_are_those_of_the_original():
-    from rl_yardstick.envs.pomdp.hallway import _world
+    from rl_yardstick.envs.pomdp import _hallway
 
-    env, world = gym.make("Hallway-v0"), _world()
+    env, world = gym.make("Hallway-v0"), _hallway()
     model = transition_model(env)
 
     def readings(cell, facing):

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rl_yardstick.envs.argument_checks import check_whole_number
-from rl_yardstick.envs.bars import Bar, Bars, BarsEnv
+from rl_yardstick.envs.drawing import Bar, Bars, BarsEnv
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
 # At most so many arms are shown, those of the contexts around the present one.

@@ -15,8 +15,6 @@ from rl_yardstick.mdp.transition_model import Floats, TransitionModel
 
 # How far probabilities of segments may be from summing to one.
 TOLERANCE = 1e-9
-# The largest number of outcomes in a model, over all contexts and arms.
-MAX_OUTCOMES = 2_000_000
 
 
 class ClickBandit(StochasticBandit):
@@ -40,11 +38,6 @@ class ClickBandit(StochasticBandit):
         render_mode: str | None,
     ) -> None:
         n_contexts, n_arms = click_rates.shape
-        if 2 * n_contexts**2 * n_arms > MAX_OUTCOMES:
-            raise ValueError(
-                f"{n_contexts} contexts and {n_arms} arms are too many: twice the square of the "
-                f"former times the latter may be at most {MAX_OUTCOMES}"
-            )
         super().__init__(
             n_arms,
             spaces.Discrete(n_contexts),
@@ -79,9 +72,8 @@ class ClickBandit(StochasticBandit):
 
     def transition_model(self) -> TransitionModel:
         """The exact dynamics as arrays, contexts being states."""
-        n_outcomes = 2 * len(self.means)
         shape = self._outcome_prob.shape
-        outcome = np.arange(n_outcomes)
+        outcome = np.arange(shape[-1])
         return TransitionModel(
             prob=self._outcome_prob,
             next_state=np.broadcast_to(outcome % len(self.means), shape),
@@ -130,7 +122,6 @@ class BernoulliBandit(ClickBandit):
     arm pulled; and `feedback_due`, always True. `reset` gives nothing.
     One uniform number is drawn by `reset`, without effect, and one by each step: the reward is 1 if
     it lies below the arm's probability.
-    The exact dynamics are available as arrays from `transition_model()`.
 
     ## Arguments
     - `probabilities=(0.2, 0.5, 0.75)`: of the arms, two or more

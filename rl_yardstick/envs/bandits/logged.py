@@ -35,21 +35,18 @@ MAX_NUMBER, MIN_PROPENSITY = 1e15, 1e-9
 NUMBER = "a finite number of no more than 1e15"
 
 
-def _is_arm(values: Floats) -> Bools:
-    is_arm: Bools = (values >= 0) & (values < MAX_ARMS) & (values == np.floor(values))
-    return is_arm
-
-
-def _is_propensity(values: Floats) -> Bools:
-    return (values >= MIN_PROPENSITY) & (values <= 1)
-
-
 # The valid values of a column: in words, and as a check of numbers.
 _CONTEXT = f"{NUMBER}: text can only be all of the context", np.isfinite
 _WANTED: Mapping[str, tuple[str, Callable[[Floats], Bools]]] = {
-    ARM: (f"a whole number from 0 to {MAX_ARMS - 1}", _is_arm),
+    ARM: (
+        f"a whole number from 0 to {MAX_ARMS - 1}",
+        lambda values: (values >= 0) & (values < MAX_ARMS) & (values == np.floor(values)),
+    ),
     REWARD: (NUMBER, np.isfinite),
-    PROPENSITY: (f"a probability from {MIN_PROPENSITY} to 1", _is_propensity),
+    PROPENSITY: (
+        f"a probability from {MIN_PROPENSITY} to 1",
+        lambda values: (values >= MIN_PROPENSITY) & (values <= 1),
+    ),
 }
 
 
@@ -134,7 +131,7 @@ def read_log(path: str | Path, own_names: Mapping[str, str] = MappingProxyType({
         raise ValueError(f"cannot read {path}: {reason}") from error
     names = tuple(name for name in found if name not in _WANTED)
     categories = None
-    if len(names) == 1 and _is_text(found[names[0]]):
+    if len(names) == 1 and np.isnan(_as_numbers(found[names[0]])).all():
         text = found[names[0]].astype("category")
         categories, found[names[0]] = tuple(text.cat.categories), text.cat.codes
     columns = {name: _numbers(str(path), name, column) for name, column in found.items()}
@@ -175,25 +172,24 @@ def _read_columns(binary: BinaryIO, own_names: Mapping[str, str]) -> dict[str, p
         raise ValueError("its rows have more values than its header")
     if not len(frame):
         raise ValueError("it holds no pulls: a header and a row for each are needed")
-    return {name: _stripped(frame.iloc[:, i]) for i, name in enumerate(header)}
+    columns = {name: frame.iloc[:, i] for i, name in enumerate(header)}
+    return {
+        name: column if column.dtype.kind in "if" else column.astype(str).str.strip()
+        for name, column in columns.items()
+    }
 
 
-def _stripped(column: pd.Series[Any]) -> pd.Series[Any]:
-    return column if column.dtype.kind in "if" else column.astype(str).str.strip()
-
-
-def _is_text(column: pd.Series[Any]) -> bool:
-    """Whether no value of a column is a number."""
+def _as_numbers(column: pd.Series[Any]) -> Floats:
+    """The values of a column, shape (n,); NaN for text."""
     import pandas as pd
 
-    return bool(pd.to_numeric(column, errors="coerce").isna().all())
+    values: Floats = pd.to_numeric(column, errors="coerce").to_numpy(np.float64)
+    return values
 
 
 def _numbers(source: str, name: str, column: pd.Series[Any]) -> Floats:
     """The values of a column, shape (n,); ValueError for the first one that is invalid."""
-    import pandas as pd
-
-    values: Floats = pd.to_numeric(column, errors="coerce").to_numpy(np.float64)
+    values = _as_numbers(column)
     wanted, valid = _WANTED.get(name, _CONTEXT)
     wrong = np.flatnonzero(~((np.abs(values) <= MAX_NUMBER) & valid(values)))
     if len(wrong):

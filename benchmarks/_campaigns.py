@@ -1,18 +1,26 @@
-"""The commands that `fault_campaign` disturbs, each with the commands that it needs before."""
+"""Comparable contents of files, and the commands that `fault_campaign` disturbs."""
 
 from __future__ import annotations
 
+import contextlib
+import csv
+import gzip
+import io
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import time
+import zipfile
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from _run_contents import contents
+import numpy as np
+import torch as th
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = "n_steps:64 batch_size:32 n_envs:2 n_epochs:2"
@@ -74,53 +82,34 @@ class Case:
 
     In its words ``{logs}`` stands for the folder that it writes to, ``{before}`` for that of the
     commands before it.
-
-    Attributes:
-        name: shown in the table.
-        folder: of all its files.
-        words: the command and its arguments.
-        before: commands to run once before, undisturbed.
-        begins_with_them: whether its folder begins with their files.
-        is_told: whether its result is its output.
-        whole: the files of the undisturbed command.
-        seconds: the time of the undisturbed command.
-        counts: signals, and outcomes of disturbed commands.
     """
 
     name: str
-    folder: Path
+    folder: Path  # of all its files
     words: list[str]
-    before: tuple[list[str], ...] = ()
-    begins_with_them: bool = False
-    is_told: bool = False
-    whole: dict[str, Any] = field(default_factory=dict)
-    seconds: float = 0.0
-    counts: Counter[str] = field(default_factory=Counter)
+    before: tuple[list[str], ...] = ()  # commands to run once before, undisturbed
+    begins_with_them: bool = False  # whether its folder begins with their files
+    is_told: bool = False  # whether its result is its output
+    whole: dict[str, Any] = field(default_factory=dict)  # the files of the undisturbed command
+    seconds: float = 0.0  # the time of the undisturbed command
+    counts: Counter[str] = field(default_factory=Counter)  # signals, outcomes of disturbed commands
     said: str = ""
 
-    @property
-    def is_study(self) -> bool:
-        """Whether it has workers."""
-        return self.words[0] in ("compare.py", "tune.py") and not self.is_told
-
-    def prepare(self) -> None:
-        """Run the commands before it."""
-        for words in self.before:
-            self._must(self._started(words, self.folder / "before"))
-
     def run_in_peace(self) -> None:
-        """Run the command undisturbed, twice; the second time counts, with all code compiled."""
+        """Run the commands before it, and it undisturbed, twice: the second time is compiled."""
+        for words in self.before:
+            self._must(self.start(self.folder / "before", words))
         for name in ("warm", "whole"):
             logs = self.folder_of(name)
             begun = time.monotonic()
             self._must(self.start(logs))
             self.seconds = time.monotonic() - begun
-            self.read_said()
         self.whole = self.result(self.folder / "whole")
 
     def _must(self, process: subprocess.Popen[str]) -> None:
-        if process.wait():
-            raise SystemExit(f"{self.name}: {self.read_said()}")
+        code, said = process.wait(), self.read_said()
+        if code:
+            raise SystemExit(f"{self.name}: {said}")
 
     def folder_of(self, name: str) -> Path:
         """A folder for the command to write to, with its initial files."""
@@ -128,14 +117,11 @@ class Case:
             shutil.copytree(self.folder / "before", self.folder / name)
         return self.folder / name
 
-    def start(self, logs: Path) -> subprocess.Popen[str]:
+    def start(self, logs: Path, words: list[str] | None = None) -> subprocess.Popen[str]:
         """Start the command in its own session, so that orphaned processes can be found."""
-        return self._started(self.words, logs)
-
-    def _started(self, words: list[str], logs: Path) -> subprocess.Popen[str]:
-        before = self.folder / "before"
+        places = {"{logs}": str(logs), "{before}": str(self.folder / "before")}
         filled = [
-            word.replace("{logs}", str(logs)).replace("{before}", str(before)) for word in words
+            re.sub(r"{logs}|{before}", lambda m: places[m[0]], w) for w in words or self.words
         ]
         if filled[0].endswith(".py"):
             filled = [str(ROOT / filled[0]), *filled[1:], "-f", str(logs)]
@@ -165,6 +151,12 @@ class Case:
         # The output before the table is progress.
         table = self.said[self.said.find("┏") :]
         return {**found, "what it said": table} if self.is_told else found
+
+
+def send(pid: int, number: int) -> None:
+    """Send a signal to a process, if it is still there."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, number)
 
 
 def cases(folder: Path) -> list[Case]:
@@ -212,3 +204,57 @@ def _others(folder: Path) -> list[Case]:
             is_told=True,
         ),
     ]
+
+
+# --- what is compared: contents of files without times and durations ------------------------------
+
+TIMES = ("seconds", "cpu_seconds")
+# Also digests of files with times, the settings with the folder's name, and the process.
+NOT_COMPARED = (*TIMES, "began", "date", "ended", "files", "spec", "process", "command", "packed")
+
+
+def contents(logs: Path) -> dict[str, Any]:
+    """The contents of a run's or a study's files without times and durations, by relative name.
+
+    The numbers of the folders with replaced runs of a study are left out of the names.
+    """
+    files = sorted(path for path in logs.rglob("*") if path.is_file())
+    names = [re.sub(r"/replaced/\d+/", "/replaced/", p.relative_to(logs).as_posix()) for p in files]
+    return dict(zip(names, map(_content, files), strict=True))
+
+
+def _content(path: Path) -> Any:
+    if path.suffix == ".zip":
+        with zipfile.ZipFile(path) as members:
+            tensors = [n for n in members.namelist() if n.endswith(".pth")]
+            return [_bits(th.load(io.BytesIO(members.read(name)))) for name in tensors]
+    if path.suffix == ".npz":
+        return {name: array.tobytes() for name, array in np.load(path).items()}
+    if path.name.endswith("monitor.csv"):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        return [line.split(",")[:2] for line in lines[1:]]
+    if path.suffix == ".json":
+        return _without_times(json.loads(path.read_text(encoding="utf-8")))
+    if path.suffix in (".csv", ".gz"):
+        opened = gzip.open if path.suffix == ".gz" else open
+        with opened(path, "rt", encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        return [{k: v for k, v in row.items() if k not in (*TIMES, "path")} for row in rows]
+    if path.suffix == ".gif":
+        return path.read_bytes()
+    # Other files contain commands, durations and folders.
+    return path.suffix
+
+
+def _without_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_times(v) for k, v in value.items() if k not in NOT_COMPARED}
+    return [_without_times(held) for held in value] if isinstance(value, list) else value
+
+
+def _bits(value: Any) -> Any:
+    if isinstance(value, th.Tensor):
+        return value.detach().numpy().tobytes()
+    if isinstance(value, dict):
+        return [(name, _bits(held)) for name, held in value.items()]
+    return [_bits(held) for held in value] if isinstance(value, list | tuple) else value
