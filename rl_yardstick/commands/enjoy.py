@@ -227,7 +227,7 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
 def expected_return(spec: TrainSpec, agent: Any, deterministic: bool) -> Evaluation | str | None:
     """The policy's exact evaluation; or a line on why figures are sampled; None if unknown."""
     from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
-    from rl_yardstick.pipeline.evaluation.histories import by_histories, world_of_memory
+    from rl_yardstick.pipeline.evaluation.judge import by_histories, world_of_memory
     from rl_yardstick.pipeline.evaluation.policies import why_not_exact
 
     world = world_of_memory(spec, agent) if deterministic else None

@@ -340,7 +340,7 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     import torch as th
 
     from rl_yardstick.agents.linear.algorithm import TileAlgorithm
-    from rl_yardstick.pipeline.evaluation.critics import own_values
+    from rl_yardstick.pipeline.evaluation.policies import own_values
 
     policy, batch = model.policy, np.stack(observations)
     for holder in (policy, model):

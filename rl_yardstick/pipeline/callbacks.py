@@ -377,7 +377,7 @@ class EvaluationCallback(EvalCallback):
         if not 0 <= time.monotonic() - self._written_at < SECONDS_BETWEEN_WRITES:
             self.write()
         if self.value_maps is not None:
-            self.value_maps.record(self.model, self.num_timesteps)
+            self.value_maps.count(self.model)
         if self.critics is not None:
             self.critics.judge(self.num_timesteps, self.episodes_seen)
         self._log(found)

@@ -274,7 +274,7 @@ class Parts:
                 evaluation.evaluate()
             evaluation.write()
             if evaluation.value_maps is not None:
-                evaluation.value_maps.finish(agent, agent.num_timesteps)
+                evaluation.value_maps.finish(agent)
             if evaluation.critics is not None:
                 evaluation.critics.finish(agent.num_timesteps)
             evaluation.take_statistics()

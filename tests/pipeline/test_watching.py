@@ -113,7 +113,7 @@ def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, st
     run, outcome = run_of(watched_spec(algo, settings), tmp_path)
     watch = outcome.watch
     watch.finish()
-    rows = watch.moments.rows
+    rows = watch.rows
     assert (rows["timesteps"].tolist(), watch.n_units) == ([*steps], len(steps) - 1)
     assert rows["number"].tolist() == [*range(len(steps))]
     assert rows["loss"][-1] == watch.model.logger.name_to_value["train/loss"]

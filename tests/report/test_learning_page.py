@@ -57,7 +57,7 @@ def test_without_a_table_the_policy_in_every_state(watched, page_of):
     data, text = page_of(spec, watch)
     assert (data["kind"], data["unit"], data["stride"]) == ("maps", "evaluation", 1)
     assert "from evaluation to evaluation" in text
-    rows, moments = watch.moments.rows, data["moments"]
+    rows, moments = watch.rows, data["moments"]
     assert moments["timesteps"] == rows["timesteps"].tolist()
     assert moments["timesteps"][0] == 0
     assert moments["actions"][-1] == rows["actions"][-1].tolist()

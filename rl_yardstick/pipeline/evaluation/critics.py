@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import time
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,7 +24,6 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from rl_yardstick.agents.common.callbacks import BlockCallback
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
-from rl_yardstick.agents.linear.tiles import tiles_of_all, vectors_of
 from rl_yardstick.agents.planning import PlanningAgent
 from rl_yardstick.envs.known_models import (
     action_masks_of_states,
@@ -42,26 +40,22 @@ from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.evaluation.exact import is_wrapped_as_vector
 from rl_yardstick.pipeline.evaluation.policies import (
     OfLastPolicy,
-    believed_values,
     best_actions,
     is_network,
     obstacle,
+    own_values,
     policy_matrix,
     takes_masks,
 )
+from rl_yardstick.pipeline.evaluation.sampled import progress_of
 from rl_yardstick.pipeline.files import write_text
 from rl_yardstick.pipeline.spec import TrainSpec
 
-SECONDS_BETWEEN_WRITES = 1.0
-
 # Agents that always learn the values of their exploring policy.
-EXPLORING = frozenset(
-    {
-        "sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo",
-        "semi_gradient_sarsa",
-    }
-)  # fmt: skip
-
+EXPLORING = (
+    *("sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo"),
+    "semi_gradient_sarsa",
+)
 # Gradients are computed for at most this many minibatches of a rollout.
 MOST_MINIBATCHES = 32
 # In larger models, even one comparison takes too long.
@@ -90,27 +84,23 @@ class KnownWorld:
 
         return OfLastPolicy(shares)
 
-    @cached_property
-    def _last_values(self) -> dict[float, OfLastPolicy[PolicyValues]]:
-        return {}
-
     def values(self, policy: Floats, discount: float) -> PolicyValues:
-        """The exact values of a policy (S, A)."""
-        known = self._last_values.setdefault(
-            discount, OfLastPolicy(lambda asked: discounted_values(self.model, asked, discount))
-        )
-        return known(policy)
+        """The exact values of a policy (S, A); those of the last policy are cached."""
+        if discount not in self._values:
+            self._values[discount] = OfLastPolicy(
+                lambda policy: discounted_values(self.model, policy, discount)
+            )
+        return self._values[discount](policy)
+
+    @cached_property
+    def _values(self) -> dict[float, OfLastPolicy[PolicyValues]]:
+        return {}
 
     @cached_property
     def numbers(self) -> dict[bytes, int]:
         """The index of each state, by the bytes of its observation."""
         rows = np.ascontiguousarray(self.observations.reshape(len(self.observations), -1))
         return {row.tobytes(): number for number, row in enumerate(rows)}
-
-    @property
-    def tells_states_apart(self) -> bool:
-        """Whether every state has a different observation."""
-        return len(self.numbers) == self.model.n_states
 
     def states_of(self, observations: NDArray[Any], n_rows: int) -> Ints:
         """The indices of the states with these ``n_rows`` observations, shape (n_rows,)."""
@@ -152,17 +142,6 @@ def known_world(spec: TrainSpec, agent: BaseAlgorithm) -> KnownWorld | str:
     return world
 
 
-def own_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
-    """An agent's values of actions (S, A) or states (S,); None if it has none."""
-    if not isinstance(agent, SoftmaxAlgorithm):
-        return believed_values(agent, observations)
-    policy = agent.policy
-    if not len(policy.state_weights):
-        return None
-    active = tiles_of_all(policy.tiles, vectors_of(policy.observation_space, observations))
-    return np.asarray(policy.state_weights.numpy()[active].sum(axis=1))
-
-
 def recorder_of(
     path: Path, spec: TrainSpec, agent: BaseAlgorithm, *, is_evaluated: bool
 ) -> CriticRecorder | str:
@@ -176,8 +155,8 @@ def recorder_of(
     if not isinstance(agent, OnPolicyAlgorithm):
         return CriticRecorder(path, world, spec, explores=explores)
     has_rollouts = type(agent.rollout_buffer) is RolloutBuffer or takes_masks(agent)
-    is_seen = has_rollouts and world.tells_states_apart
-    return (RolloutRecorder if is_seen else CriticRecorder)(path, world, spec, explores=True)
+    has_rollouts &= len(world.numbers) == world.model.n_states  # observations tell states apart
+    return (RolloutRecorder if has_rollouts else CriticRecorder)(path, world, spec, explores=True)
 
 
 def learns_exploring_values(spec: TrainSpec, agent: BaseAlgorithm) -> bool:
@@ -198,13 +177,8 @@ class CriticRecorder(BlockCallback):
 
     def __init__(self, path: Path, world: KnownWorld, spec: TrainSpec, *, explores: bool) -> None:
         super().__init__()
-        self.path, self.world, self.explores = path, world, explores
-        # With an explicit evaluation interval, the agent is compared at each evaluation.
-        self.is_limited = spec.eval_freq is None
-        self.training_steps = spec.n_timesteps
-        self.training_episodes = spec.n_episodes
+        self.path, self.world, self.spec, self.explores = path, world, spec, explores
         self.rows: list[dict[str, float]] = []
-        self._written_at = -np.inf
 
     def _on_step(self) -> bool:
         return True
@@ -216,14 +190,9 @@ class CriticRecorder(BlockCallback):
 
     def can_afford(self, n_episodes: int) -> bool:
         """Whether the training has done enough steps for another comparison."""
-        if not self.is_limited:
+        if self.spec.eval_freq is not None:  # each evaluation is compared
             return True
-        n_trained = self.model.num_timesteps - self.model._num_timesteps_at_start
-        if self.training_episodes is not None:
-            progress = n_episodes / self.training_episodes
-        else:
-            progress = n_trained / (self.training_steps or 1)
-        planned = n_trained / progress if progress > 0 else 0.0
+        progress, planned = progress_of(self.spec, self.model, n_episodes)
         least = SECONDS_OF_NETWORKS if is_network(self.model) else SECONDS_IN_ANY_CASE
         allowed = max(SHARE * planned * seconds_per_step(self.model), least)
         cost = seconds_of_comparison(self.world, self.model, explores=self.explores)
@@ -233,12 +202,6 @@ class CriticRecorder(BlockCallback):
         """Compare the agent at the end of training, and write the file."""
         if not self.rows or self.rows[-1]["timesteps"] < timesteps:
             self._append(timesteps, self.figures())
-        self.write()
-
-    def write(self) -> None:
-        """Write the rows up to now."""
-        if not self.rows:
-            return
         known = {name for row in self.rows for name in row}
         names = ["timesteps", *(name for name in MEANINGS if name in known)]
         text = io.StringIO()
@@ -246,17 +209,12 @@ class CriticRecorder(BlockCallback):
         table.writeheader()
         table.writerows(self.rows)
         write_text(self.path, text.getvalue())
-        self._written_at = time.monotonic()
 
     def _append(self, timesteps: int, figures: dict[str, float]) -> None:
         finite = {name: value for name, value in figures.items() if np.isfinite(value)}
         self.rows.append({"timesteps": timesteps, **finite})
         for name, value in finite.items():
             self.model.logger.record(f"diagnosis/{name}", value)
-        if time.monotonic() - self._written_at > SECONDS_BETWEEN_WRITES:
-            self.write()
-
-    # --- what is compared -------------------------------------------------------------------------
 
     def policy(self) -> Floats:
         """The target policy of the agent's values, as probabilities of shape (S, A)."""
@@ -321,12 +279,7 @@ class RolloutRecorder(CriticRecorder):
     Until then, the policy is the same as during the whole rollout and the evaluation within it.
     """
 
-    def __init__(self, path: Path, world: KnownWorld, spec: TrainSpec, *, explores: bool) -> None:
-        super().__init__(path, world, spec, explores=explores)
-        self.asked_at: int | None = None  # the time step of the evaluation
-
-    def wants_rollout_end(self) -> bool:
-        return self.asked_at is not None
+    asked_at: int | None = None  # the time step of the evaluation
 
     def judge(self, timesteps: int, n_episodes: int) -> None:
         if self.can_afford(n_episodes):

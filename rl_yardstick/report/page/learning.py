@@ -115,7 +115,7 @@ def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
 
     Every ``stride``-th update or evaluation is shown, and the last in any case.
     """
-    evaluator, rows = recorder.evaluator, recorder.moments.rows
+    evaluator, rows = recorder.evaluator, recorder.rows
     shown = rows[(rows["number"] % stride == 0) | (np.arange(len(rows)) == len(rows) - 1)]
     reachable = evaluator.model.reachable
     optimal = evaluator.optimum[0][reachable]
