@@ -51,7 +51,7 @@ from rl_yardstick.pipeline.pictures import draw
 from rl_yardstick.pipeline.progress import ProgressCallback
 from rl_yardstick.pipeline.run import FAILED, FINISHED, INTERRUPTED, Run
 from rl_yardstick.pipeline.spec import TrainSpec
-from rl_yardstick.pipeline.watching import EvaluationMaps, Watch, watch_of
+from rl_yardstick.pipeline.watching import Watch, watch_of
 
 # What libraries raise for settings that they cannot work with.
 REFUSALS = (ValueError, TypeError, AssertionError, RuntimeError, MemoryError)  # of constructors
@@ -171,7 +171,7 @@ class Parts:
         maps = None if exact is None else ValueMapRecorder(run.path / "value_maps.npz", exact)
         evaluator, eval_env = self.judge.evaluator, self.judge.env
         self.evaluation = EvaluationCallback(run, eval_env, evaluator, frequencies, maps, critics)
-        self.watch = watch_of(spec, self.agent, exact)
+        self.watch = watch_of(spec, self.agent, maps)
         self.pulls = self._pull_recorder()
         self.clock = Clock()
         self.progress = ProgressCallback(
@@ -194,9 +194,7 @@ class Parts:
         Numbers are checked before anything keeps them, and a saved state is put back before any
         other callback acts.
         """
-        spec, run, watch = self.spec, self.run, self.watch
-        if isinstance(watch, EvaluationMaps):
-            self.evaluation.callback, watch = watch, None
+        spec, run = self.spec, self.run
         with_buffer = spec.save_replay_buffer
         others: list[BaseCallback | None] = [
             *(self._of_settings()),
@@ -204,7 +202,7 @@ class Parts:
             EpisodeCheckpoint(run, spec.save_every_n_episodes, with_buffer)
             if spec.save_every_n_episodes > 0
             else None,
-            *(self.pulls, self.evaluation.critics, watch, self.evaluation),
+            *(self.pulls, self.evaluation.critics, self.watch, self.evaluation),
             EpisodeBudget(spec.n_episodes) if spec.n_episodes is not None else None,
             *(self.clock, self.progress),
         ]
@@ -293,7 +291,7 @@ class Parts:
             getattr(evaluation.evaluator, "n_steps", 0),
             getattr(agent, "engine_in_use", None),
             summarise_pulls(self.pulls.arrays()) if self.pulls is not None and pulled else None,
-            self.watch,
+            self.watch or (evaluation.value_maps if self.spec.watch_learning else None),
             self._advice(final),
             self.judge.exact is not None,
         )

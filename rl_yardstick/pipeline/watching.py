@@ -1,130 +1,27 @@
-"""Records a training while it runs, for a page that replays it.
-
-For agents with tables it records each step; for all others, maps of the greedy policy.
-"""
+"""Records each step of a table's training, for a page that replays it."""
 
 from __future__ import annotations
 
 import math
-from contextlib import suppress
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from rl_yardstick.agents.common.algorithm import true_outcome
 from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
-from rl_yardstick.pipeline.evaluation.value_maps import MAX_STATES, MapSeries, best_actions_of
-from rl_yardstick.pipeline.finite_numbers import NotFiniteError, check_model
+from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
 from rl_yardstick.pipeline.spec import TrainSpec
 
-# --- maps -----------------------------------------------------------------------------------------
-
-MOST_MAPS = 1000
-MOST_FIGURES = 200_000  # numbers in all maps together
-FEWEST_MAPS = 2  # the first and the last
-
-# Log entries of the library's agents, by their names on the page.
-LOGGED = {name: f"train/{name}" for name in ("loss", "policy_loss", "value_loss", "entropy_loss")}
-
-
-class MapRecorder(MapSeries, BaseCallback):
-    """Records the greedy policy and its state values before the training and after many units."""
-
-    unit: ClassVar[str]
-
-    def __init__(self, evaluator: ExactEvaluator) -> None:
-        BaseCallback.__init__(self)
-        most = min(max(MOST_FIGURES // (2 * evaluator.model.n_states), FEWEST_MAPS), MOST_MAPS)
-        MapSeries.__init__(self, evaluator, most)
-
-    @property
-    def rows(self) -> NDArray[np.void]:
-        """The records; figures are NaN where the agent has none."""
-        states = (self.evaluator.model.n_states,)
-        maps = ("values", np.float64, states), ("actions", np.int64, states)
-        figures = [(name, np.float64) for name in ("exploration", *LOGGED, "training_return")]
-        kind = [("number", np.int64), ("timesteps", np.int64), *maps, *figures]
-        return np.array(self.moments, dtype=kind)
-
-    def figures(self, agent: Any) -> tuple[float, ...]:
-        """The rate of exploration, the losses of the last update, the mean of last episodes."""
-        # From the schedule, because the agent's own rate is set only at the first step.
-        schedule = getattr(agent, "exploration_schedule", lambda progress: math.nan)
-        log = agent.logger.name_to_value if self.n_units else {}
-        returns = [episode["r"] for episode in agent.ep_info_buffer or ()]
-        return (
-            float(schedule(agent._current_progress_remaining)),
-            *(log.get(name, math.nan) for name in LOGGED.values()),
-            float(np.mean(returns)) if returns else math.nan,
-        )
-
-    def _on_training_start(self) -> None:
-        if not self.moments:
-            self.append(self.model)
-
-    def _on_step(self) -> bool:
-        return True
-
-    def finish(self) -> None:
-        """Record the map at the end, unless it is not finite."""
-        with suppress(NotFiniteError):
-            check_model(self.model)
-            self._on_rollout_start()  # the last update follows the last rollout
-            self.append(self.model)
-
-
-class EvaluationMaps(MapRecorder):
-    """Records a map after every evaluation."""
-
-    unit = "evaluation"
-
-    def _on_step(self) -> bool:
-        self.count(self.model)
-        return True
-
-
-class UpdateMaps(MapRecorder, BlockCallback):
-    """Records a map after every update, at the start of rollouts, which can stay compiled."""
-
-    unit = "update"
-
-    def _on_training_start(self) -> None:
-        super()._on_training_start()
-        self._seen = self._n_updates()
-
-    def _n_updates(self) -> int:  # several in a phase of training
-        return int(self.model._n_updates)  # type: ignore[attr-defined]
-
-    def _on_rollout_start(self) -> None:
-        if (seen := self._n_updates()) != self._seen:
-            self._seen = seen
-            self.count(self.model)
-
-
-# --- steps ----------------------------------------------------------------------------------------
-
-# Limits for a page of three megabytes; MOVES_UNASKED applies without ``--watch-episodes``.
+# Limits for a page of three megabytes.
 MOST_MOVES = 20_000
 MOST_CHANGES = 60_000
-MOVES_UNASKED = 5_000
 MOST_ENTRIES = 100_000
-# Limits of the search for the rise of the return, and steps between evaluations of the policy.
-MOVES_SEARCHED = 50_000
-CHANGES_SEARCHED = 1_000_000
-STEPS_BETWEEN_RETURNS = 100
-# The return has risen once it has covered this share of the way to its maximum.
-RISEN = 0.9
-STEPS_BEHIND = 500  # steps kept after the rise
 
 # How a step ended an episode, if it did.
 GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
@@ -178,18 +75,15 @@ class GrowingRows:
 
 
 class TableRecorder(BlockCallback):
-    """Records the steps of the first ``n_episodes``, over all environments.
+    """Records the first steps over all environments: 20,000, or those of ``n_episodes`` if not 0.
 
-    For 0 episodes, it records the steps in which the greedy policy's return rises, computed by
-    ``exact``, or the first 5000 steps without ``exact``. It finds changed entries by comparing the
-    tables before and after an update, for any learning rule.
+    It finds changed entries by comparing the tables before and after an update, for any learning
+    rule.
     """
 
-    def __init__(self, n_episodes: int, exact: ExactEvaluator | None = None) -> None:
+    def __init__(self, n_episodes: int = 0) -> None:
         super().__init__()
         self.n_episodes = n_episodes
-        self.exact = None if n_episodes else exact
-        self._greedy_returns: list[float] = []  # one after each `STEPS_BETWEEN_RETURNS` steps
         self.names: list[str] = []  # of the tables
         self.has_actions = False  # whether the first table has a number for each state and action
         self.initial: dict[str, Floats] = {}  # the tables before the first step
@@ -217,7 +111,6 @@ class TableRecorder(BlockCallback):
             self._tables = [table.copy() for table in self.initial.values()]
             self._returns = np.zeros(self.model.n_envs)
             self._episodes = np.zeros(self.model.n_envs, dtype=np.int64)
-            self._note_return()
         self._obs = np.array(self.model._last_obs)
         told = getattr(self.model, "last_steps", None)
         if told is not None:  # cleared, so that the next step cannot read an old number
@@ -271,43 +164,10 @@ class TableRecorder(BlockCallback):
                 step, after = len(self.steps) - 1, now.reshape(-1)[moved]
                 self.changes.extend(len(moved), step=step, table=number, entry=moved, after=after)
                 before.reshape(-1)[moved] = after
-        if len(self.steps) % STEPS_BETWEEN_RETURNS == 0:
-            self._note_return()
-        self._look_whether_full()
-
-    def _look_whether_full(self) -> None:
-        n_moves, n_changes = len(self.moves), len(self.changes)
-        if self.exact is not None:
-            has_risen = len(self.steps) >= self._end_of_rise(self.exact.yardstick.optimum)
-            self.is_cut = has_risen and n_moves >= MOVES_UNASKED
-            self.is_cut |= n_moves > MOVES_SEARCHED or n_changes > CHANGES_SEARCHED
-        else:
-            most = MOST_MOVES if self.n_episodes else MOVES_UNASKED
-            self.is_cut = n_moves + self.model.n_envs > most or n_changes > MOST_CHANGES
         is_done = self.n_episodes > 0 and self._episodes.sum() >= self.n_episodes
-        self.is_cut &= not is_done
-        self.is_full = self.is_cut or is_done
-
-    def _note_return(self) -> None:
-        if self.exact is not None:
-            self._greedy_returns.append(self.exact(self.model).mean_return)
-
-    def _end_of_rise(self, best: float) -> float:
-        """The step with enough steps behind the rise of the return to ``best``; else infinity."""
-        first = self._greedy_returns[0]
-        near = np.array(self._greedy_returns) >= first + RISEN * (best - first)
-        return STEPS_BETWEEN_RETURNS * near.argmax() + STEPS_BEHIND if near.any() else math.inf
-
-    def window(self) -> tuple[int, int]:
-        """The steps to show, [first, end): whole episodes up to the rise of the greedy return."""
-        n, n_envs, moves = len(self.steps), self.model.n_envs, self.moves.rows
-        if not self._greedy_returns:
-            return 0, n
-        end = max(self._end_of_rise(max(self._greedy_returns)), MOVES_UNASKED // n_envs)
-        end = min(n, int(end))
-        ends = moves["step"][(moves["env"] == 0) & (moves["end"] != GOES_ON)] + 1
-        begins = np.append(0, ends[ends < end])
-        return int(begins[begins >= min(end - MOST_MOVES // n_envs, begins[-1])][0]), end
+        has_room = len(self.moves) + agent.n_envs <= MOST_MOVES
+        self.is_full = is_done or not has_room or len(self.changes) > MOST_CHANGES
+        self.is_cut = self.is_full and not is_done
 
 
 def tables_of(agent: BaseAlgorithm) -> dict[str, Floats]:
@@ -328,14 +188,15 @@ def has_actions(agent: BaseAlgorithm, table: Floats) -> bool:
     return table.ndim > 1 and table.shape[-1] == actions.n and table.shape[-2] in (states.n, 1)
 
 
-Watch = TableRecorder | MapRecorder
+Watch = TableRecorder | ValueMapRecorder
 
 
-def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None) -> Watch | None:
-    """Make the recorder for an untrained agent; None without ``--watch-learning``."""
+def watch_of(
+    spec: TrainSpec, agent: BaseAlgorithm, maps: ValueMapRecorder | None
+) -> TableRecorder | None:
+    """The recorder of an untrained agent with tables; None if none is asked for, and for maps."""
     if spec.watch_learning is None:
         return None
-    can_be_mapped = exact is not None and exact.model.n_states <= MAX_STATES
     if isinstance(agent, LearningAlgorithm) and (tables := tables_of(agent)):
         n_entries = sum(table.size for table in tables.values())
         if n_entries > MOST_ENTRIES:
@@ -343,16 +204,15 @@ def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None
                 f"--watch-learning shows tables of up to {MOST_ENTRIES:,} entries; those of "
                 f"{spec.algo} on {spec.env_id} have {n_entries:,}"
             )
-        return TableRecorder(spec.watch_episodes, exact if can_be_mapped else None)
-    if exact is None or not can_be_mapped or best_actions_of(exact, agent) is None:
+        return TableRecorder(spec.watch_episodes)
+    if maps is None or not maps.can_record(agent):
         raise UserError(
             f"--watch-learning shows tables, or an agent's actions in up to 2,500 known states: "
             f"{spec.algo} on {spec.env_id} has neither"
         )
-    tells_updates = isinstance(agent, OnPolicyAlgorithm | OffPolicyAlgorithm)
-    if spec.watch_episodes:
-        raise UserError(
-            f"--watch-episodes is for agents with tables: {spec.algo} is shown at each "
-            f"{'update' if tells_updates else 'evaluation'}"
+    if spec.watch_episodes or (spec.eval_freq or 1) < 0:
+        flag = (
+            "--watch-episodes is for agents with tables" if spec.watch_episodes else "--eval-freq"
         )
-    return UpdateMaps(exact) if tells_updates else EvaluationMaps(exact)
+        raise UserError(f"{flag}: {spec.algo} is shown at each evaluation")
+    return None

@@ -6,11 +6,13 @@ deterministic policy from there, with the whole time limit left; not the agent's
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rl_yardstick.envs.layout import GridLayout
@@ -77,69 +79,69 @@ def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | N
     return policy.argmax(axis=1)[None] if (policy.max(axis=1) == 1).all() else None
 
 
-class MapSeries:
-    """The greedy policies and their state values after many units of a training.
-
-    Of too many maps every 2nd is kept, then every 4th, and so on.
-
-    Attributes:
-        moments: number of the unit, time steps, values (S,), actions (S,), further figures.
-        stride: of so many units one is kept.
-        n_units: units so far.
-    """
-
-    def __init__(self, evaluator: ExactEvaluator, most: int) -> None:
-        self.evaluator, self.most = evaluator, most
-        self.moments: list[tuple[Any, ...]] = []
-        self.stride, self.n_units = 1, 0
-
-    def count(self, agent: BaseAlgorithm) -> None:
-        """Count a unit, and record its map if its number is a multiple of the stride."""
-        self.n_units += 1
-        if self.n_units % self.stride == 0:
-            self.append(agent)
-        if len(self.moments) > self.most:
-            self.stride *= 2
-            self.moments = [moment for moment in self.moments if moment[0] % self.stride == 0]
-
-    def append(self, agent: BaseAlgorithm) -> None:
-        """Record the current map, unless it is the last one."""
-        now, policy = (self.n_units, agent.num_timesteps), best_actions_of(self.evaluator, agent)
-        if policy is not None and (not self.moments or self.moments[-1][:2] != now):
-            values = self.evaluator.values(policy)
-            self.moments.append((*now, values, policy[0], *self.figures(agent)))
-
-    def figures(self, agent: Any) -> tuple[float, ...]:
-        """Further figures of the agent."""
-        return ()
+# Log entries of the library's agents, by their names on pages.
+LOGGED = {name: f"train/{name}" for name in ("loss", "policy_loss", "value_loss", "entropy_loss")}
 
 
-class ValueMapRecorder(MapSeries):
-    """Records the maps of an agent on a grid over its training in the file ``path``.
+class ValueMapRecorder:
+    """Records the maps of an agent at its evaluations; on a grid, in the file ``path``.
 
     The file has `timesteps` (T,), `values` (T, S), `actions` (T, S), `optimal_values` (S,) and
-    `optimal_actions` (S, A), as in `ValueMap`.
+    `optimal_actions` (S, A), as in `ValueMap`. Of too many maps it keeps every 2nd, 4th, ... one.
     """
 
     def __init__(self, path: Path, evaluator: ExactEvaluator) -> None:
-        super().__init__(evaluator, MAX_MAPS)
-        self.path = path
+        self.path, self.evaluator = path, evaluator
+        self.moments: list[tuple[Any, ...]] = []
+        self.stride, self.n_units = 1, 0  # evaluations, one in ``stride`` of which is kept
 
-    def append(self, agent: BaseAlgorithm) -> None:
-        if self.evaluator.layout is not None and self.evaluator.model.n_states <= MAX_STATES:
-            super().append(agent)
+    def can_record(self, agent: BaseAlgorithm) -> bool:
+        """Whether there are few states, and the agent has one action in each."""
+        is_small = self.evaluator.model.n_states <= MAX_STATES
+        return is_small and best_actions_of(self.evaluator, agent) is not None
+
+    def count(self, agent: BaseAlgorithm) -> None:
+        """Count an evaluation, and record its map if its number is a multiple of the stride."""
+        self.n_units += 1
+        if self.n_units % self.stride == 0:
+            self._append(agent)
+        if len(self.moments) > MAX_MAPS:
+            self.stride *= 2
+            self.moments = [moment for moment in self.moments if moment[0] % self.stride == 0]
+
+    def _append(self, agent: Any) -> None:
+        if self.evaluator.model.n_states > MAX_STATES:
+            return
+        now, policy = (self.n_units, agent.num_timesteps), best_actions_of(self.evaluator, agent)
+        if policy is None or (self.moments and self.moments[-1][1] == agent.num_timesteps):
+            return
+        log = agent.logger.name_to_value
+        schedule = getattr(agent, "exploration_schedule", lambda progress: math.nan)
+        returns = [episode["r"] for episode in agent.ep_info_buffer or ()]
+        figures = [log.get(name, math.nan) for name in LOGGED.values()]
+        figures += [float(schedule(agent._current_progress_remaining))]
+        figures += [float(np.mean(returns)) if returns else math.nan]
+        self.moments.append((*now, *figures, self.evaluator.values(policy), policy[0]))
+
+    @property
+    def rows(self) -> NDArray[np.void]:
+        """All maps, with figures of the agent: NaN where it has none."""
+        figures = [(name, np.float64) for name in (*LOGGED, "exploration", "training_return")]
+        states = (self.evaluator.model.n_states,)
+        maps = ("values", np.float64, states), ("actions", np.int64, states)
+        kind = [("number", np.int64), ("timesteps", np.int64), *figures, *maps]
+        return np.array(self.moments, dtype=kind)
 
     def finish(self, agent: BaseAlgorithm) -> None:
         """Record the map at the end of training, and write all maps."""
-        self.append(agent)
-        if not self.moments:
+        self._append(agent)
+        if self.evaluator.layout is None or not self.moments:
             return
-        _, timesteps, values, actions = zip(*self.moments, strict=True)
-        optimal_values, optimal_actions = self.evaluator.optimum
+        rows, (optimal_values, optimal_actions) = self.rows, self.evaluator.optimum
         arrays: dict[str, Any] = {
-            "timesteps": timesteps,
-            "values": values,
-            "actions": np.array(actions, np.min_scalar_type(optimal_actions.shape[1] - 1)),
+            "timesteps": rows["timesteps"],
+            "values": rows["values"],
+            "actions": rows["actions"].astype(np.min_scalar_type(optimal_actions.shape[1] - 1)),
             "optimal_values": optimal_values,
             "optimal_actions": optimal_actions,
         }

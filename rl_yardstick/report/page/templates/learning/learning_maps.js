@@ -1,8 +1,8 @@
 "use strict";
 
-// A page of maps: one before the training, and one after each update or evaluation.
+// A page of maps: one at each evaluation.
 const mapShow = (data) => {
-  const { moments, unit } = data;
+  const { moments } = data;
   const { timesteps } = moments;
   // Colours span the optimal values, and as much again below them.
   const [lowest, high] = data.optimal_range;
@@ -59,9 +59,8 @@ const mapShow = (data) => {
     ]));
     curves.forEach((curve) => curve.go(place(position)));
     const number = moments.number[position];
-    if (position === 0) return "before the training";
     if (number === moments.number[position - 1]) return "at the end";
-    return `${unit} ${number.toLocaleString("en")} of ${data.n_units.toLocaleString("en")}`;
+    return `evaluation ${number.toLocaleString("en")} of ${data.n_units.toLocaleString("en")}`;
   };
   pick.addEventListener("change", () => draw(shownNow));
   return {
