@@ -379,7 +379,7 @@ class EvaluationCallback(EvalCallback):
         if self.value_maps is not None:
             self.value_maps.count(self.model)
         if self.critics is not None:
-            self.critics.judge(self.num_timesteps, self.episodes_seen)
+            self.critics.judge(self.num_timesteps)
         self._log(found)
         if found.mean_return > self.best_mean_reward:
             self.best_mean_reward = found.mean_return

@@ -13,7 +13,7 @@ from rich.console import Console
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
-from rl_yardstick.pipeline import map_pictures as drawing
+from rl_yardstick.pipeline import pictures as drawing
 from rl_yardstick.pipeline import progress, watching
 from rl_yardstick.pipeline.curve_pictures import read_monitors
 from rl_yardstick.pipeline.environments import make_training_env

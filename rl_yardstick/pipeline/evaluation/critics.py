@@ -17,7 +17,6 @@ from typing import Any, cast
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from stable_baselines3 import A2C
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -33,7 +32,6 @@ from rl_yardstick.envs.known_models import (
 )
 from rl_yardstick.mdp import TransitionModel, state_visitation
 from rl_yardstick.mdp.advantages import PolicyValues, discounted_values, expected_estimates
-from rl_yardstick.mdp.graph import LARGEST_DENSE
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.curve_pictures import MEANINGS
 from rl_yardstick.pipeline.environments import make_single_env
@@ -41,13 +39,11 @@ from rl_yardstick.pipeline.evaluation.exact import is_wrapped_as_vector
 from rl_yardstick.pipeline.evaluation.policies import (
     OfLastPolicy,
     best_actions,
-    is_network,
     obstacle,
     own_values,
     policy_matrix,
     takes_masks,
 )
-from rl_yardstick.pipeline.evaluation.sampled import progress_of
 from rl_yardstick.pipeline.files import write_text
 from rl_yardstick.pipeline.spec import TrainSpec
 
@@ -153,10 +149,10 @@ def recorder_of(
         return world
     explores = learns_exploring_values(spec, agent) or isinstance(agent, SoftmaxAlgorithm)
     if not isinstance(agent, OnPolicyAlgorithm):
-        return CriticRecorder(path, world, spec, explores=explores)
+        return CriticRecorder(path, world, explores=explores)
     has_rollouts = type(agent.rollout_buffer) is RolloutBuffer or takes_masks(agent)
     has_rollouts &= len(world.numbers) == world.model.n_states  # observations tell states apart
-    return (RolloutRecorder if has_rollouts else CriticRecorder)(path, world, spec, explores=True)
+    return (RolloutRecorder if has_rollouts else CriticRecorder)(path, world, explores=True)
 
 
 def learns_exploring_values(spec: TrainSpec, agent: BaseAlgorithm) -> bool:
@@ -170,33 +166,21 @@ class CriticRecorder(BlockCallback):
     Args:
         path: the file.
         world: the environment that the agent trains on.
-        spec: the spec of the training.
         explores: whether the agent learns the values of its exploring policy, else those of its
             greedy policy.
     """
 
-    def __init__(self, path: Path, world: KnownWorld, spec: TrainSpec, *, explores: bool) -> None:
+    def __init__(self, path: Path, world: KnownWorld, *, explores: bool) -> None:
         super().__init__()
-        self.path, self.world, self.spec, self.explores = path, world, spec, explores
+        self.path, self.world, self.explores = path, world, explores
         self.rows: list[dict[str, float]] = []
 
     def _on_step(self) -> bool:
         return True
 
-    def judge(self, timesteps: int, n_episodes: int) -> None:
-        """Compare the agent now, unless comparisons would take too large a share of training."""
-        if self.can_afford(n_episodes):
-            self._append(timesteps, self.figures())
-
-    def can_afford(self, n_episodes: int) -> bool:
-        """Whether the training has done enough steps for another comparison."""
-        if self.spec.eval_freq is not None:  # each evaluation is compared
-            return True
-        progress, planned = progress_of(self.spec, self.model, n_episodes)
-        least = SECONDS_OF_NETWORKS if is_network(self.model) else SECONDS_IN_ANY_CASE
-        allowed = max(SHARE * planned * seconds_per_step(self.model), least)
-        cost = seconds_of_comparison(self.world, self.model, explores=self.explores)
-        return (len(self.rows) + 1) * cost <= allowed * min(progress, 1.0)
+    def judge(self, timesteps: int) -> None:
+        """Compare the agent at an evaluation."""
+        self._append(timesteps, self.figures())
 
     def finish(self, timesteps: int) -> None:
         """Compare the agent at the end of training, and write the file."""
@@ -281,9 +265,8 @@ class RolloutRecorder(CriticRecorder):
 
     asked_at: int | None = None  # the time step of the evaluation
 
-    def judge(self, timesteps: int, n_episodes: int) -> None:
-        if self.can_afford(n_episodes):
-            self.asked_at = timesteps
+    def judge(self, timesteps: int) -> None:
+        self.asked_at = timesteps
 
     def _on_rollout_end(self) -> None:
         if self.asked_at is None:
@@ -386,42 +369,3 @@ def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> 
         )
         found.append(th.cat([slope.reshape(-1) for slope in slopes if slope is not None]))
     return np.asarray(th.stack(found).double().cpu().numpy())
-
-
-# --- how often to compare -------------------------------------------------------------------------
-
-# The share of training time for comparisons, by the estimates below: high ones for comparisons, low
-# ones for training steps. No clock is used, so the same seed gives the same file.
-SHARE = 0.1
-SECONDS_IN_ANY_CASE = 5e-3
-SECONDS_OF_NETWORKS = 2e-2  # the same for networks
-
-
-def seconds_per_step(model: BaseAlgorithm) -> float:
-    """A lower estimate of the time of a training step."""
-    engine, learns_weights = getattr(model, "engine_in_use", "") or "", is_network(model)
-    if engine.startswith("compiled but"):
-        return 2e-5
-    if engine.startswith("compiled"):
-        return 2.5e-6 if isinstance(model, A2C) else 1e-5 if learns_weights else 7e-8
-    return 7e-5 if learns_weights else 4e-5
-
-
-def seconds_of_comparison(world: KnownWorld, model: BaseAlgorithm, *, explores: bool) -> float:
-    """An upper estimate of the time of a comparison."""
-    per_state = world.model.n_actions * world.model.n_outcomes
-    n_states = int(world.model.reachable.sum())
-    visits = 7e-9 * world.horizon * n_states * per_state
-    seconds = (7e-4 + visits) if explores else (4e-4 + visits / 3)
-    seconds += 2e-7 * world.model.prob.size
-    if n_states <= LARGEST_DENSE:
-        seconds += 1e-10 * n_states**3
-    else:
-        seconds += (3e-5 if explores else 3e-6) * n_states
-    if model.gamma == 1:  # type: ignore[attr-defined]
-        seconds *= 2  # first it finds the states from which every episode ends
-    if is_network(model):
-        seconds += 1e-3 + 5e-6 * world.model.n_states
-    if isinstance(model, OnPolicyAlgorithm):
-        seconds += 7e-3 + 6e-6 * model.n_steps * model.n_envs
-    return seconds

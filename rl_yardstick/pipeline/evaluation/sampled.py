@@ -219,15 +219,6 @@ def allowed_steps(n_trained: float, shares: Shares) -> float:
     return max(shares.usual * n_trained, at_first, STEPS_IN_ANY_CASE)
 
 
-def progress_of(spec: TrainSpec, model: BaseAlgorithm, n_episodes: int) -> tuple[float, float]:
-    """The share of a training that is done, and the steps that it will have at this rate."""
-    n_trained = model.num_timesteps - model._num_timesteps_at_start
-    progress = n_trained / (spec.n_timesteps or math.inf)
-    if spec.n_episodes is not None:
-        progress = n_episodes / spec.n_episodes
-    return progress, n_trained / progress if progress > 0 else 0.0
-
-
 # Of the allowed steps; the final evaluation gets the rest, but at least the other half.
 PART_DURING_TRAINING = 1 / 2
 
@@ -259,7 +250,11 @@ class SampledEvaluator:
         """Whether the training has done enough steps for another evaluation."""
         # Explicit intervals or numbers of episodes take precedence over the limit.
         if self.spec.eval_episodes is None and self.spec.eval_freq is None:
-            progress, planned = progress_of(self.spec, model, n_episodes)
+            n_trained = model.num_timesteps - model._num_timesteps_at_start
+            progress = n_trained / (self.spec.n_timesteps or math.inf)
+            if self.spec.n_episodes is not None:
+                progress = n_episodes / self.spec.n_episodes
+            planned = n_trained / progress if progress > 0 else 0.0
             allowed = self._allowed(model, planned) * min(progress, 1.0)
             self._left = allowed * PART_DURING_TRAINING - self.n_steps
         length = self._last_length
