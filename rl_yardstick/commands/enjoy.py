@@ -67,7 +67,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--no-render", action="store_const", const="none", dest="render", help="--render none")
     pace = f"pictures a second of --render ansi on a terminal (default: {FRAMES_PER_SECOND})"
     add("--fps", type=whole_number(1, 60), metavar="N", help=pace)
-    add("--record", type=filled, metavar="FILE", help="write a film, .gif or .mp4")
+    add("--record", type=filled, metavar="FILE", help="write a film, .gif")
     add("--reward-log", metavar="DIR", help="also write the returns there, as Monitor's CSV files")
     add("--verbose", type=VERBOSITY, default=1, help="0 for no output (default: 1)")
     add("--norm-reward", action="store_true", help="returns of normalised rewards, as in training")

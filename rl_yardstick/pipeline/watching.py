@@ -28,50 +28,29 @@ GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
 NO_STATE = -1
 
 # A step of all environments; the learning rate is NaN if it is not from the schedule.
-STEP = [("timesteps", np.int64), ("exploration", np.float64), ("learning_rate", np.float64)]
+STEP = np.dtype(
+    [("timesteps", np.int64), ("exploration", np.float64), ("learning_rate", np.float64)]
+)
 # One environment's part of a step.
-MOVE = [
-    ("step", np.int64),  # number of the step
-    ("env", np.int64),
-    ("episode", np.int64),  # of this environment, from 0 on
-    ("obs", np.int64),  # `NO_STATE` if observations are not numbers
-    ("action", np.int64),
-    ("reward", np.float64),
-    ("next_obs", np.int64),  # before any reset
-    ("end", np.int64),
-    ("target", np.float64),  # NaN without an update, or if the agent does not report it
-    ("td_error", np.float64),
-    ("episode_return", np.float64),  # sum of rewards so far
-]
+MOVE = np.dtype(
+    [
+        ("step", np.int64),  # number of the step
+        ("env", np.int64),
+        ("episode", np.int64),  # of this environment, from 0 on
+        ("obs", np.int64),  # `NO_STATE` if observations are not numbers
+        ("action", np.int64),
+        ("reward", np.float64),
+        ("next_obs", np.int64),  # before any reset
+        ("end", np.int64),
+        ("target", np.float64),  # NaN without an update, or if the agent does not report it
+        ("td_error", np.float64),
+        ("episode_return", np.float64),  # sum of rewards so far
+    ]
+)
 # A table entry that a step has changed; ``entry`` is its index in the flattened table.
-CHANGE = [("step", np.int64), ("table", np.int64), ("entry", np.int64), ("after", np.float64)]
-
-
-class GrowingRows:
-    """An array of records that grows by doubling; fast to save with the training."""
-
-    def __init__(self, kind: list[tuple[str, Any]]) -> None:
-        self._rows: NDArray[np.void] = np.zeros(256, dtype=kind)
-        self._n = 0
-
-    def __len__(self) -> int:
-        return self._n
-
-    @property
-    def rows(self) -> NDArray[np.void]:
-        """All appended records, shape (n,)."""
-        return self._rows[: self._n]
-
-    def extend(self, n: int, **columns: Any) -> None:
-        """Append ``n`` records; each column has n numbers, or one for all."""
-        end = self._n + n
-        if end > len(self._rows):
-            larger = np.zeros(2 * end, dtype=self._rows.dtype)
-            larger[: self._n] = self.rows
-            self._rows = larger
-        for name, values in columns.items():
-            self._rows[name][self._n : end] = values
-        self._n = end
+CHANGE = np.dtype(
+    [("step", np.int64), ("table", np.int64), ("entry", np.int64), ("after", np.float64)]
+)
 
 
 class TableRecorder(BlockCallback):
@@ -87,15 +66,24 @@ class TableRecorder(BlockCallback):
         self.names: list[str] = []  # of the tables
         self.has_actions = False  # whether the first table has a number for each state and action
         self.initial: dict[str, Floats] = {}  # the tables before the first step
-        self.steps = GrowingRows(STEP)
-        self.moves = GrowingRows(MOVE)
-        self.changes = GrowingRows(CHANGE)
+        self.steps: list[NDArray[np.void]] = []  # one array of `STEP` and of `MOVE` for each step
+        self.moves: list[NDArray[np.void]] = []
+        self.changes: list[NDArray[np.void]] = []  # of `CHANGE`
+        self.n_changes = 0
         self.is_full = False
         self.is_cut = False  # whether these episodes have more steps than recorded
         self._tables: list[Floats] = []  # after the previous step
         self._obs: Any = None
         self._returns = np.zeros(0)
         self._episodes = np.zeros(0, dtype=np.int64)
+
+    def rows(self) -> dict[str, NDArray[np.void]]:
+        """All records of steps, moves and changes."""
+        return {
+            "steps": np.concatenate([np.empty(0, STEP), *self.steps]),
+            "moves": np.concatenate([np.empty(0, MOVE), *self.moves]),
+            "changes": np.concatenate([np.empty(0, CHANGE), *self.changes]),
+        }
 
     def horizon(self) -> Horizon:
         """After each step, as long as steps are recorded."""
@@ -123,27 +111,20 @@ class TableRecorder(BlockCallback):
         told = self.locals
         next_obs, terminated = true_outcome(told["new_obs"], told["dones"], told["infos"])
         self._returns += told["rewards"]
-        ends = np.where(terminated, TERMINATED, TRUNCATED)
-        has_states = isinstance(agent.observation_space, spaces.Discrete)
-        self.moves.extend(
-            agent.n_envs,
-            step=len(self.steps),
-            env=np.arange(agent.n_envs),
-            episode=self._episodes,
-            obs=self._obs if has_states else NO_STATE,
-            action=told["actions"],
-            reward=told["rewards"],
-            next_obs=next_obs if has_states else NO_STATE,
-            end=np.where(told["dones"], ends, GOES_ON),
-            target=math.nan,
-            td_error=math.nan,
-            episode_return=self._returns,
-        )
+        moves = np.zeros(agent.n_envs, dtype=MOVE)
+        moves["step"], moves["env"] = len(self.steps), np.arange(agent.n_envs)
+        moves["episode"], moves["episode_return"] = self._episodes, self._returns
+        is_number = isinstance(agent.observation_space, spaces.Discrete)
+        moves["obs"] = self._obs if is_number else NO_STATE
+        moves["next_obs"] = next_obs if is_number else NO_STATE
+        moves["action"], moves["reward"] = told["actions"], told["rewards"]
+        moves["end"] = np.where(told["dones"], np.where(terminated, TERMINATED, TRUNCATED), GOES_ON)
+        moves["target"] = moves["td_error"] = math.nan
         rate = math.nan
         if not agent.averages_samples and agent.learning_rate != 0.0:
             rate = float(agent.lr_schedule(agent._current_progress_remaining))
-        now, exploration = self.num_timesteps, agent.exploration_rate
-        self.steps.extend(1, timesteps=now, exploration=exploration, learning_rate=rate)
+        self.steps.append(np.array([(self.num_timesteps, agent.exploration_rate, rate)], STEP))
+        self.moves.append(moves)
         self._returns[told["dones"]] = 0.0
         self._episodes[told["dones"]] += 1
         return True
@@ -154,19 +135,22 @@ class TableRecorder(BlockCallback):
         agent: Any = self.model
         told = getattr(agent, "last_steps", None)
         if told is not None:
-            last = self.moves.rows[-agent.n_envs :]
-            last["target"], last["td_error"] = told["target"], told["td_error"]
+            self.moves[-1]["target"] = told["target"]
+            self.moves[-1]["td_error"] = told["td_error"]
         for number, now in enumerate(tables_of(agent).values()):
             before = self._tables[number]
             # nan is unequal to itself, but has not changed.
             moved = np.flatnonzero((before != now) & ~(np.isnan(before) & np.isnan(now)))
             if len(moved):
-                step, after = len(self.steps) - 1, now.reshape(-1)[moved]
-                self.changes.extend(len(moved), step=step, table=number, entry=moved, after=after)
-                before.reshape(-1)[moved] = after
+                changes = np.zeros(len(moved), dtype=CHANGE)
+                changes["step"], changes["table"] = len(self.steps) - 1, number
+                changes["entry"], changes["after"] = moved, now.reshape(-1)[moved]
+                before.reshape(-1)[moved] = changes["after"]
+                self.changes.append(changes)
+                self.n_changes += len(moved)
         is_done = self.n_episodes > 0 and self._episodes.sum() >= self.n_episodes
-        has_room = len(self.moves) + agent.n_envs <= MOST_MOVES
-        self.is_full = is_done or not has_room or len(self.changes) > MOST_CHANGES
+        has_room = (len(self.moves) + 1) * agent.n_envs <= MOST_MOVES
+        self.is_full = is_done or not has_room or self.n_changes > MOST_CHANGES
         self.is_cut = self.is_full and not is_done
 
 

@@ -43,9 +43,9 @@ def test_targets_are_those_of_the_rule_to_the_last_bit(engine):
     agent, recorder = watched(LAKE, n_timesteps=2000, engine=engine, learning_rate=0.3)
     assert agent.engine_in_use.startswith(engine)
     table = recorder.initial["q_tables"].copy()[0]
-    changes = {row["step"]: row for row in recorder.changes.rows}
-    assert len(changes) == len(recorder.changes)  # one entry at a time
-    for move in recorder.moves.rows:
+    changes = {row["step"]: row for row in recorder.rows()["changes"]}
+    assert len(changes) == recorder.n_changes  # one entry at a time
+    for move in recorder.rows()["moves"]:
         follows = 0.0 if move["end"] == TERMINATED else 0.99 * table[move["next_obs"]].max()
         assert move["target"] == move["reward"] + follows
         at = move["obs"], move["action"]
@@ -100,16 +100,13 @@ def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
 
 
 def test_of_a_network_there_is_a_map_at_each_evaluation(tmp_path):
-    run, outcome = run_of(watched_spec("ppo", SMALL_PPO, eval_freq=50), tmp_path)
-    rows = outcome.watch.rows
-    assert rows["timesteps"].tolist() == [50, 100, 150, 200, 250, 300, 320]
-    assert rows["number"].tolist() == [1, 2, 3, 4, 5, 6, 6]
-    assert np.isfinite(rows["loss"]).any()
+    _, outcome = run_of(watched_spec("ppo", SMALL_PPO, eval_freq=50), tmp_path)
+    numbers, timesteps, values, _ = zip(*outcome.watch.moments, strict=True)
+    assert timesteps == (50, 100, 150, 200, 250, 300, 320)
+    assert numbers == (1, 2, 3, 4, 5, 6, 6)
     # What the start is worth at the end is the return that was computed of the final agent.
-    at_start = rows["values"] @ outcome.watch.evaluator.model.initial
-    assert at_start[-1] == pytest.approx(outcome.final.mean_return, abs=1e-12)
-    lengths = [float(row[0]) for row in episodes_of(run.path)]
-    assert rows["training_return"][-1] == pytest.approx(np.mean(lengths[-100:]))
+    at_start = values[-1] @ outcome.watch.evaluator.model.initial
+    assert at_start == pytest.approx(outcome.final.mean_return, abs=1e-12)
 
 
 def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, monkeypatch):
@@ -294,7 +291,7 @@ def test_two_episodes_worked_by_hand():
     """With step size and discount 1/2: targets 1, 2, then 1 + 1/2 = 1.5, 2."""
     halves = {"learning_rate": 0.5, "gamma": 0.5}
     _, recorder = watched(Corridor(), n_timesteps=9, n_episodes=2, **halves)
-    moves, changes = recorder.moves.rows, recorder.changes.rows
+    moves, changes = recorder.rows()["moves"], recorder.rows()["changes"]
     assert moves["target"].tolist() == [1.0, 2.0, 1.5, 2.0]
     assert moves["td_error"].tolist() == [1.0, 2.0, 1.0, 1.0]
     assert moves["obs"].tolist() == [0, 1, 0, 1]
@@ -306,7 +303,7 @@ def test_two_episodes_worked_by_hand():
     assert changes["entry"].tolist() == [0, 1, 0, 1]
     assert changes["after"].tolist() == [0.5, 1.0, 1.0, 1.5]
     assert changes["step"].tolist() == [0, 1, 2, 3]
-    assert recorder.steps.rows["timesteps"].tolist() == [1, 2, 3, 4]
-    assert recorder.steps.rows["learning_rate"].tolist() == [0.5] * 4
+    assert recorder.rows()["steps"]["timesteps"].tolist() == [1, 2, 3, 4]
+    assert recorder.rows()["steps"]["learning_rate"].tolist() == [0.5] * 4
     # The two episodes are over: nothing was left out.
     assert (recorder.is_full, recorder.is_cut) == (True, False)

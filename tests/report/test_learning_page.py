@@ -44,8 +44,8 @@ def test_the_data_are_what_was_recorded_to_the_last_digit(watched, page_of):
     data, _ = page_of(spec, watch)
     assert data["kind"] == "steps"
     for name in ("td_error", "target"):
-        assert data["moves"][name] == watch.moves.rows[name].tolist()
-    assert data["changes"]["after"] == watch.changes.rows["after"].tolist()
+        assert data["moves"][name] == watch.rows()["moves"][name].tolist()
+    assert data["changes"]["after"] == watch.rows()["changes"]["after"].tolist()
     assert data["tables"] == [{"name": "q_tables", "shape": [1, 6, 4], "fill": 0}]
     assert data["layout"]["rows"] == ["S..", "#.G"]  # the map of the training
     assert data["layout"]["moves"] == [[-1, 0], [1, 0], [0, -1], [0, 1]]
@@ -57,11 +57,9 @@ def test_without_a_table_the_policy_in_every_state(watched, page_of):
     data, text = page_of(spec, watch)
     assert (data["kind"], data["stride"]) == ("maps", 1)
     assert "from evaluation to evaluation" in text
-    rows, moments = watch.rows, data["moments"]
-    assert moments["timesteps"] == rows["timesteps"].tolist()
-    assert moments["actions"][-1] == rows["actions"][-1].tolist()
-    assert moments["return"][-1] == rows["values"][-1][0] > 0.5
-    assert set(moments["loss"]) == {None}
+    moments, (_, timesteps, values, actions) = data["moments"], watch.moments[-1]
+    assert (moments["timesteps"][-1], moments["actions"][-1]) == (timesteps, actions.tolist())
+    assert moments["return"][-1] == values[0] > 0.5
     # Where an episode has ended nothing is done.
     reachable = watch.evaluator.model.reachable.tolist()
     assert [value is not None for value in moments["values"][0]] == reachable

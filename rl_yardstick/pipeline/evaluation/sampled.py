@@ -28,11 +28,6 @@ from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 from rl_yardstick.pipeline.finite_numbers import FinitePlayer, check_numbers
 from rl_yardstick.pipeline.spec import TrainSpec
 
-# A mean this many standard errors above an upper bound shows that the bound is wrong.
-BEYOND_CHANCE = 6.0
-# Fewer episodes may all have begun in states of high return.
-FEWEST_TO_TELL = 10
-
 
 @dataclass(frozen=True)
 class OtherReturns:
@@ -86,20 +81,6 @@ class Evaluation:
         """Share of successful episodes, if the environment reports success."""
         return None if self.successes is None else float(self.successes.mean())
 
-    @property
-    def beats_optimum(self) -> bool:
-        """Whether the mean is significantly above the upper bound of the optimum.
-
-        If so, the bracket is wrong, or belongs to another environment.
-        """
-        if self.yardstick is None or self.yardstick.at_least is None:
-            return False
-        if len(self.returns) < FEWEST_TO_TELL:
-            return False
-        error = self.std_return / math.sqrt(len(self.returns) - 1)
-        # Monitor rounds returns to six digits.
-        return self.mean_return - BEYOND_CHANCE * error > self.yardstick.optimum + 1e-6
-
     def measured_by(self, yardstick: Yardstick | None) -> Evaluation:
         """The same figures with another yardstick."""
         return replace(self, yardstick=yardstick)
@@ -126,8 +107,6 @@ class Evaluation:
             figures |= self.yardstick.figures(self.mean_return)
         if self.others is not None:
             figures |= asdict(self.others)
-        if self.beats_optimum:
-            figures["beats_optimum"] = True
         return figures
 
 

@@ -6,13 +6,11 @@ deterministic policy from there, with the whole time limit left; not the agent's
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rl_yardstick.envs.layout import GridLayout
@@ -79,10 +77,6 @@ def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | N
     return policy.argmax(axis=1)[None] if (policy.max(axis=1) == 1).all() else None
 
 
-# Log entries of the library's agents, by their names on pages.
-LOGGED = {name: f"train/{name}" for name in ("loss", "policy_loss", "value_loss", "entropy_loss")}
-
-
 class ValueMapRecorder:
     """Records the maps of an agent at its evaluations; on a grid, in the file ``path``.
 
@@ -92,7 +86,8 @@ class ValueMapRecorder:
 
     def __init__(self, path: Path, evaluator: ExactEvaluator) -> None:
         self.path, self.evaluator = path, evaluator
-        self.moments: list[tuple[Any, ...]] = []
+        # number of the evaluation, time steps, values (S,), actions (S,)
+        self.moments: list[tuple[int, int, Floats, Ints]] = []
         self.stride, self.n_units = 1, 0  # evaluations, one in ``stride`` of which is kept
 
     def can_record(self, agent: BaseAlgorithm) -> bool:
@@ -109,39 +104,25 @@ class ValueMapRecorder:
             self.stride *= 2
             self.moments = [moment for moment in self.moments if moment[0] % self.stride == 0]
 
-    def _append(self, agent: Any) -> None:
+    def _append(self, agent: BaseAlgorithm) -> None:
         if self.evaluator.model.n_states > MAX_STATES:
             return
         now, policy = (self.n_units, agent.num_timesteps), best_actions_of(self.evaluator, agent)
         if policy is None or (self.moments and self.moments[-1][1] == agent.num_timesteps):
             return
-        log = agent.logger.name_to_value
-        schedule = getattr(agent, "exploration_schedule", lambda progress: math.nan)
-        returns = [episode["r"] for episode in agent.ep_info_buffer or ()]
-        figures = [log.get(name, math.nan) for name in LOGGED.values()]
-        figures += [float(schedule(agent._current_progress_remaining))]
-        figures += [float(np.mean(returns)) if returns else math.nan]
-        self.moments.append((*now, *figures, self.evaluator.values(policy), policy[0]))
-
-    @property
-    def rows(self) -> NDArray[np.void]:
-        """All maps, with figures of the agent: NaN where it has none."""
-        figures = [(name, np.float64) for name in (*LOGGED, "exploration", "training_return")]
-        states = (self.evaluator.model.n_states,)
-        maps = ("values", np.float64, states), ("actions", np.int64, states)
-        kind = [("number", np.int64), ("timesteps", np.int64), *figures, *maps]
-        return np.array(self.moments, dtype=kind)
+        self.moments.append((*now, self.evaluator.values(policy), policy[0]))
 
     def finish(self, agent: BaseAlgorithm) -> None:
         """Record the map at the end of training, and write all maps."""
         self._append(agent)
         if self.evaluator.layout is None or not self.moments:
             return
-        rows, (optimal_values, optimal_actions) = self.rows, self.evaluator.optimum
+        _, timesteps, values, actions = zip(*self.moments, strict=True)
+        optimal_values, optimal_actions = self.evaluator.optimum
         arrays: dict[str, Any] = {
-            "timesteps": rows["timesteps"],
-            "values": rows["values"],
-            "actions": rows["actions"].astype(np.min_scalar_type(optimal_actions.shape[1] - 1)),
+            "timesteps": timesteps,
+            "values": values,
+            "actions": np.array(actions, np.min_scalar_type(optimal_actions.shape[1] - 1)),
             "optimal_values": optimal_values,
             "optimal_actions": optimal_actions,
         }

@@ -21,7 +21,7 @@ from rl_yardstick.experiments.pool import process_pool
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.errors import UserError, one_line
-from rl_yardstick.pipeline.evaluation.value_maps import LOGGED, MAX_STATES, ValueMapRecorder
+from rl_yardstick.pipeline.evaluation.value_maps import MAX_STATES, ValueMapRecorder
 from rl_yardstick.pipeline.files import read_bytes, read_json, write_json, write_text
 from rl_yardstick.pipeline.models import MAX_MODEL
 from rl_yardstick.pipeline.modules import import_modules
@@ -58,13 +58,14 @@ def _count(number: int, word: str) -> str:
 
 def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
     """The first ``most_steps`` recorded steps of a tabular agent."""
-    steps, moves, changes = recorder.steps.rows[:most_steps], recorder.moves, recorder.changes
+    rows = recorder.rows()
+    steps, moves, changes = rows["steps"][:most_steps], rows["moves"], rows["changes"]
     return {
         "kind": "steps",
         "tables": [_table(name, table) for name, table in recorder.initial.items()],
         "steps": _columns(steps),
-        "moves": _columns(moves.rows[moves.rows["step"] < most_steps]),
-        "changes": _columns(changes.rows[changes.rows["step"] < most_steps]),
+        "moves": _columns(moves[moves["step"] < most_steps]),
+        "changes": _columns(changes[changes["step"] < most_steps]),
         "is_cut": recorder.is_cut or most_steps < len(recorder.steps),
         "n_timesteps": recorder.model.num_timesteps,
         "is_longer": recorder.model.num_timesteps > steps["timesteps"][-1],
@@ -88,21 +89,19 @@ def maps_data(recorder: ValueMapRecorder, stride: int) -> dict[str, Any]:
 
     Every ``stride``-th evaluation is shown, and the last in any case.
     """
-    evaluator, rows = recorder.evaluator, recorder.rows
-    shown = rows[(rows["number"] % stride == 0) | (np.arange(len(rows)) == len(rows) - 1)]
+    evaluator, last = recorder.evaluator, len(recorder.moments) - 1
+    shown = [m for i, m in enumerate(recorder.moments) if m[0] % stride == 0 or i == last]
+    numbers, timesteps, values, actions = map(np.array, zip(*shown, strict=True))
     reachable = evaluator.model.reachable
     optimal = evaluator.optimum[0][reachable]
-    moments = {
-        **_columns(shown),
-        "values": np.where(reachable, shown["values"], np.nan),
-        "return": shown["values"] @ evaluator.model.initial,
-    }
+    moments = {"number": numbers, "timesteps": timesteps, "actions": actions}
+    moments["values"] = np.where(reachable, values, np.nan)
+    moments["return"] = values @ evaluator.model.initial
     return {
         "kind": "maps",
         "n_units": recorder.n_units,
         "stride": stride,
         "moments": moments,
-        "logged": LOGGED,
         "optimum": evaluator.yardstick.optimum,
         "optimal_range": [optimal.min(), optimal.max()],
     }
