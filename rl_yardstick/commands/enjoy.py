@@ -218,9 +218,8 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
     from rl_yardstick.pipeline.evaluation.sampled import Evaluation, bracketed_yardstick
 
     returns, lengths = np.array(show.played, dtype=np.float64).T
-    played = Evaluation(returns, lengths, None)
-    if not is_normalised:
-        played = played.measured_by(bracketed_yardstick(spec))
+    yardstick = None if is_normalised else bracketed_yardstick(spec)
+    played = Evaluation(returns, lengths, None, yardstick=yardstick)
     return result_lines(played, f"length {figures(played.mean_length)[0]}")
 
 

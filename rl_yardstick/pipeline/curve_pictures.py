@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
@@ -49,9 +48,6 @@ GREY = "#9A9A9A"
 
 MOVING_AVERAGE_EPISODES = 100
 MAX_POINTS = 5000
-MOST_POWERS = 12  # powers of ten on an axis
-# From this ratio on, the largest values flatten the rest of a linear axis: two decades.
-DWARFED = 100
 
 
 def read_monitors(folder: Path) -> tuple[Floats, Floats]:
@@ -79,34 +75,22 @@ def moving_average(values: Floats, width: int) -> Floats:
     return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
 
 
-def symlog_ticks(linear_up_to: float) -> list[float]:
-    """Ticks of a symmetric logarithmic axis: 0, one in the linear part, two for each power."""
-    power = math.floor(math.log10(linear_up_to))
-    within = max(m for m in (1, 2, 5) if m * 10.0**power <= linear_up_to) * 10.0**power
-    beyond = [m * 10.0**k for k in range(power, power + MOST_POWERS) for m in (1, 3)]
-    sizes = [within, *(size for size in beyond if size > linear_up_to)]
-    return [-size for size in reversed(sizes)] + [0.0, *sizes]
-
-
 def draw_learning_curve(
     folder: Path,
     title: str,
-    first_step: int = 0,
-    yardstick: Yardstick | None = None,
+    evaluations: Mapping[int, float],
+    first_step: int,
+    yardstick: Yardstick | None,
     *,
-    on_variant: bool = False,
+    on_variant: bool,
 ) -> None:
-    """Draw training returns, from ``first_step`` on, and evaluations into the run folder."""
+    """Draw training returns, from ``first_step`` on, and evaluations by steps into a folder."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
     steps, returns = read_monitors(folder)
-    evaluated_at = means = np.empty(0)
-    if (folder / "evaluations.npz").exists():
-        with np.load(folder / "evaluations.npz") as arrays:
-            evaluated_at, means = arrays["timesteps"], arrays["results"].mean(axis=1)
     # Returns of a variant of the environment have a scale of their own.
-    apart = on_variant and len(steps) > 0 and (len(means) > 0 or yardstick is not None)
+    apart = on_variant and len(steps) > 0 and (len(evaluations) > 0 or yardstick is not None)
     ratios = (3, 2) if apart else (1,)
     panels = figure.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)
     judged, trained = panels[0, 0], panels[-1, 0]
@@ -118,13 +102,11 @@ def draw_learning_curve(
     if len(steps):
         what = "training on a variant" if on_variant and not apart else "training"
         _draw_training(trained, steps + first_step, returns, what)
-    if len(means):
-        label = "evaluation, mean return"
-        judged.plot(evaluated_at, means, "o-", color=BLUE, markersize=4, label=label)
+    if evaluations:
+        style: Any = {"color": BLUE, "markersize": 4, "label": "evaluation, mean return"}
+        judged.plot(list(evaluations), list(evaluations.values()), "o-", **style)
     if yardstick is not None:
         _draw_yardstick(judged, yardstick)
-    for axes, values in ((judged, means), (trained, returns))[0 if apart else 1 :]:
-        _compress_outliers(axes, values)
     judged.set_title(title, loc="left")
     for axes in panels.flat:
         _style(axes)
@@ -153,18 +135,6 @@ def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
     for label, (height, style) in lines.items():
         if height is not None:
             axes.axhline(height, color=GREEN, linestyle=style, linewidth=1.2, label=label, zorder=1)
-
-
-def _compress_outliers(axes: Axes, returns: Floats) -> None:
-    """Use a symmetric logarithmic axis if early returns are far larger than the last ones."""
-    from matplotlib.ticker import FixedLocator, StrMethodFormatter
-
-    settled = max(float(np.abs(returns[-len(returns) // 4 :]).max(initial=0)), 1.0)
-    if np.abs(returns).max(initial=0) >= DWARFED * settled:
-        axes.set_yscale("symlog", linthresh=settled)
-        axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(settled)))
-        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-        axes.set_ylabel(f"{axes.get_ylabel()}\n(log beyond ±{settled:,.0f})")
 
 
 def _style(axes: Axes) -> None:

@@ -36,12 +36,7 @@ if TYPE_CHECKING:
 
 
 def draw(folder: Path, parts: Any) -> None:
-    """Draw what a training has left, with ``pictures`` in its spec.
-
-    Args:
-        folder: the run folder.
-        parts: the `Parts` of the training, at its end.
-    """
+    """Draw what a training has left into its folder; ``parts`` are its `Parts`, at its end."""
     spec, evaluation, agent = parts.spec, parts.evaluation, parts.agent
     if not spec.pictures:
         return
@@ -52,7 +47,11 @@ def draw(folder: Path, parts: Any) -> None:
         if not has_pulls or evaluation.evaluations_timesteps:
             first_step, scale = agent._num_timesteps_at_start, parts.judge.yardstick
             changed = bool(training_changes(spec))
-            draw_learning_curve(folder, spec.title, first_step, scale, on_variant=changed)
+            means = [float(np.mean(row)) for row in evaluation.evaluations_results]
+            evaluations = dict(zip(evaluation.evaluations_timesteps, means, strict=True))
+            draw_learning_curve(
+                folder, spec.title, evaluations, first_step, scale, on_variant=changed
+            )
         if evaluation.value_maps is not None and evaluation.is_asked_for:
             found = value_map(evaluation.value_maps.evaluator, agent)
             if found is not None:
@@ -88,8 +87,8 @@ class Policy:
     layout: GridLayout
     layer: int  # the set of collected prizes
     matters: Bools  # the cells to draw values and actions in
-    visited: Bools  # the cells that the policy reaches from the start
     differs: Bools  # where agent and optimum differ
+    visited: Bools  # the cells that the policy reaches from the start
     values: Floats  # expected return from each cell on
     actions: Bools  # the actions to draw, shape (cells, A)
 
@@ -99,19 +98,16 @@ class Policy:
         return columns, rows
 
 
-def policies_in(found: ValueMap, layer: int) -> tuple[Policy, Policy]:
+def policies_in(found: ValueMap, layer: int) -> list[Policy]:
     """The agent's policy and the optimal ones in one layer."""
-    here = found.layout.layers == layer
+    here, common = found.layout.layers == layer, (found.matters, found.differs)
     taken = np.eye(len(found.layout.moves), dtype=np.bool_)[found.actions]
-
-    def policy(visited: Bools, values: Floats, actions: Bools) -> Policy:
-        common = found.matters[here], visited[here], found.differs[here]
-        return Policy(found.layout, layer, *common, values[here], actions[here])
-
-    return (
-        policy(found.visited, found.values, taken),
-        policy(found.optimal_visited, found.optimal_values, found.optimal_actions),
-    )
+    agent = found.visited, found.values, taken
+    best = found.optimal_visited, found.optimal_values, found.optimal_actions
+    return [
+        Policy(found.layout, layer, *(array[here] for array in (*common, *which)))
+        for which in (agent, best)
+    ]
 
 
 def draw_ground(axes: Axes, policy: Policy, scale: Normalize, colours: Colormap) -> None:
@@ -165,7 +161,8 @@ def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) ->
 
     moves = np.array(policy.layout.moves)
     lift, reach = (0.1, 0.25) if with_numbers else (0.0, 0.33)
-    head = {"headwidth": 4, "headlength": 4, "headaxislength": 3.6, "minlength": 0}
+    head: Any = {"headwidth": 4, "headlength": 4, "headaxislength": 3.6, "minlength": 0}
+    head |= {"angles": "xy", "units": "xy", "scale_units": "xy"}
     for visited, weight, strength in ((False, 0.75, 0.45), (True, 1.0, 1.0)):
         shown = policy.matters & (policy.visited == visited)
         cells, actions = np.nonzero(policy.actions & shown[:, None])
@@ -177,25 +174,20 @@ def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) ->
         axes.quiver(
             *(columns - back * right, rows - lift - back * down),
             *((1 + back) * right, (1 + back) * down),
-            angles="xy",
-            units="xy",
-            scale_units="xy",
-            scale=1,
-            **{"width": weight * width, "color": BLACK, **head, **style},
+            **{"width": weight * width, "color": BLACK, "scale": 1, **head, **style},
         )
-        still = (moves[actions] == 0).all(axis=1)
-        centres = zip(columns[still], rows[still] - lift, strict=True)
-        rings = [Annulus(centre, 0.12, weight * width) for centre in centres]
-        axes.add_collection(PatchCollection(rings, facecolor=BLACK, linewidth=0, **style))
+        if (still := (moves[actions] == 0).all(axis=1)).any():
+            centres = zip(columns[still], rows[still] - lift, strict=True)
+            rings = [Annulus(centre, 0.12, weight * width) for centre in centres]
+            axes.add_collection(PatchCollection(rings, facecolor=BLACK, linewidth=0, **style))
 
 
 def draw_numbers(axes: Axes, policy: Policy, font: float, decimals: int) -> None:
     """Write the values at the bottom of the cells, ``font`` points high."""
     style: Any = {"fontsize": font, "ha": "center", "va": "center_baseline", "color": BLACK}
-    for x, y, value in zip(
-        *policy.places(policy.matters), policy.values[policy.matters], strict=True
-    ):
-        axes.text(x, y + 0.29, short_number(value, decimals), in_layout=False, **style)
+    texts = [short_number(value, decimals) for value in policy.values[policy.matters]]
+    for x, y, text in zip(*policy.places(policy.matters), texts, strict=True):
+        axes.text(x, y + 0.29, text, in_layout=False, **style)
 
 
 def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
@@ -215,14 +207,9 @@ def return_number(value: float) -> str:
 
 
 def short_number(value: float, decimals: int) -> str:
-    """Format a value briefly: no decimals from 100 on, ``k`` for thousands, ``M`` for millions."""
+    """A value with so many decimals, of which thousands have none and end in ``k``."""
     size = abs(value)
-    if size >= 999_500:
-        text = f"{size / 1e6:.1f}M"
-    elif size >= 9_999.5:
-        text = f"{size / 1e3:.0f}k"
-    else:
-        text = f"{size:.{decimals if size < 99.5 else 0}f}"
+    text = f"{size / 1e3:.0f}k" if size >= 9_999.5 else f"{size:.{decimals * (size < 99.5)}f}"
     return f"\N{MINUS SIGN}{text}" if value < 0 and text.strip("0.") else text
 
 
@@ -260,11 +247,7 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
 def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> None:
     """Draw an agent's values and the losses of its actions into a PNG file.
 
-    Args:
-        path: the file.
-        title: the title of the picture.
-        found: the map of the agent.
-        losses: the loss in each state, in return per episode, shape (S,).
+    ``losses`` are those of each state, in return per episode, shape (S,).
     """
     shares = 100 * losses / max(float(losses.sum()), 1e-12)
     costs = replace(found, values=shares, matters=found.visited & (shares >= LEAST_SHARE))
@@ -299,6 +282,7 @@ def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar
 
     found = sides[0].shown
     layout, cell = found.layout, cell_inches(found.layout)
+    font = min(0.2 * 72 * cell, 9.0)
     # The layers that a policy reaches, those with the fewest prizes first.
     come_to = found.matters & (found.visited | found.optimal_visited)
     layers = np.unique(layout.layers[come_to]).tolist()
@@ -322,18 +306,13 @@ def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar
         for axes, side in zip(pair, sides, strict=True):
             policy = policies_in(side.shown, layer)[side.which]
             draw_ground(axes, policy, side.scale, side.colours)
-            _draw_policy(axes, policy, 72 * cell, side.decimals, thick=side.which == 0)
+            draw_marks(axes, policy, 72 * cell)
+            width = min(2.9 / (72 * cell), 0.085) * (0.5 if side.which else 1)
+            draw_arrows(axes, policy, width, with_numbers=font >= SMALLEST_FONT)
+            if font >= SMALLEST_FONT:
+                draw_numbers(axes, policy, font, side.decimals)
+            mark_differing(axes, policy, 72 * cell)
     write_png(figure, path)
-
-
-def _draw_policy(axes: Axes, policy: Policy, cell: float, decimals: int, *, thick: bool) -> None:
-    font = min(0.2 * cell, 9.0)
-    with_numbers = font >= SMALLEST_FONT
-    draw_marks(axes, policy, cell)
-    draw_arrows(axes, policy, min(2.9 / cell, 0.085) * (1 if thick else 0.5), with_numbers)
-    if with_numbers:
-        draw_numbers(axes, policy, font, decimals)
-    mark_differing(axes, policy, cell)
 
 
 def layer_name(layout: GridLayout, layer: int) -> str:

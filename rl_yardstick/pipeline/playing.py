@@ -33,12 +33,8 @@ def playing_env(
 ) -> VecEnv:
     """Make the VecEnv for playing.
 
-    Args:
-        model: the model to play.
-        mode: the render mode; `FrameTaker` returns the frames of ``ansi`` and ``rgb_array``.
-        n_envs: environments in it.
-        monitor_folder: where Monitors write.
-        norm_reward: whether returns are sums of normalised rewards, as in training.
+    `FrameTaker` returns the frames of the modes ``ansi`` and ``rgb_array``. With ``norm_reward``,
+    returns are sums of normalised rewards, as in training.
     """
     if mode == "rgb_array":
         # Rendering into memory needs no display, but SDL complains if there is none.
@@ -88,10 +84,10 @@ def play_episodes(
     Yields:
         Return and length of each episode as it ends.
     """
-    from rl_yardstick.pipeline.evaluation.policies import player
-    from rl_yardstick.pipeline.finite_numbers import FinitePlayer, check_numbers
+    from rl_yardstick.pipeline.evaluation.policies import Player
+    from rl_yardstick.pipeline.finite_numbers import check_numbers
 
-    choose = FinitePlayer(player(model, env), "while it is played").predict
+    choose = Player(model, env, "while it is played").predict
     obs: Any = env.reset()
     state = None
     starts = np.ones(env.num_envs, dtype=bool)

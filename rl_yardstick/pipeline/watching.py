@@ -15,7 +15,11 @@ from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
+from rl_yardstick.pipeline.evaluation.value_maps import (
+    MAX_STATES,
+    ValueMapRecorder,
+    best_actions_of,
+)
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # Limits for a page of three megabytes.
@@ -189,7 +193,8 @@ def watch_of(
                 f"{spec.algo} on {spec.env_id} have {n_entries:,}"
             )
         return TableRecorder(spec.watch_episodes)
-    if maps is None or not maps.can_record(agent):
+    is_small = maps is not None and maps.evaluator.model.n_states <= MAX_STATES
+    if maps is None or not is_small or best_actions_of(maps.evaluator, agent) is None:
         raise UserError(
             f"--watch-learning shows tables, or an agent's actions in up to 2,500 known states: "
             f"{spec.algo} on {spec.env_id} has neither"

@@ -43,7 +43,7 @@ def figures(evaluation):
 
 def episodes(*returns, length=10, yardstick=None, successes=None):
     lengths = np.full(len(returns), length)
-    return Evaluation(np.array(returns, float), lengths, successes).measured_by(yardstick)
+    return Evaluation(np.array(returns, float), lengths, successes, yardstick=yardstick)
 
 
 # --- seeds ---------------------------------------------------------------------------------------

@@ -80,17 +80,14 @@ class KnownWorld:
 
         return OfLastPolicy(shares)
 
-    def values(self, policy: Floats, discount: float) -> PolicyValues:
-        """The exact values of a policy (S, A); those of the last policy are cached."""
-        if discount not in self._values:
-            self._values[discount] = OfLastPolicy(
-                lambda policy: discounted_values(self.model, policy, discount)
-            )
-        return self._values[discount](policy)
-
     @cached_property
     def _values(self) -> dict[float, OfLastPolicy[PolicyValues]]:
         return {}
+
+    def values(self, policy: Floats, discount: float) -> PolicyValues:
+        """The exact values of a policy (S, A)."""
+        new = OfLastPolicy(lambda asked: discounted_values(self.model, asked, discount))
+        return self._values.setdefault(discount, new)(policy)
 
     @cached_property
     def numbers(self) -> dict[bytes, int]:

@@ -93,11 +93,12 @@ class HiddenScale:
         best = self.best
         if best is None or not best.needs_chance:
             return None
-        found = "" if best.lower == best.upper else " found"
-        firm_found = "" if best.is_firm_known else " found"
+        found = [
+            "" if known else " found" for known in (best.lower == best.upper, best.is_firm_known)
+        ]
         return (
-            f"the best memoryless policy{found} is stochastic and returns {best.lower:.2f}; "
-            f"the best deterministic one{firm_found}, as in evaluations, returns {best.firm:.2f}"
+            f"the best memoryless policy{found[0]} is stochastic and returns {best.lower:.2f}; "
+            f"the best deterministic one{found[1]}, as in evaluations, returns {best.firm:.2f}"
         )
 
 
@@ -110,12 +111,8 @@ def hidden_scale(
 ) -> HiddenScale | None:
     """The optima under partial observability; None if a memoryless policy reaches the optimum.
 
-    Args:
-        model: the decision process.
-        observations: the observation of each state, states along the first axis.
-        horizon: the time limit.
-        full_optimum: the optimum of policies of the state.
-        baseline: the return of the best random or constant policy.
+    ``observations`` has the states along its first axis; ``full_optimum`` is that of policies of
+    the state, ``baseline`` the return of the best random or constant policy.
     """
     groups = observation_groups(observations, model.reachable)
     if groups is None:
@@ -183,15 +180,11 @@ class ExactEvaluator:
     @cached_property
     def _worth(self) -> OfLastPolicy[Evaluation]:
         def worth(policy: NDArray[Any]) -> Evaluation:
-            result = policy_return(self.model, policy, self.horizon, success=self.success)
-            rate = result.success_rate
-            return Evaluation(
-                returns=np.array([result.expected_return]),
-                lengths=np.array([result.expected_length]),
-                successes=None if rate is None else np.array([rate]),
-                exact_std=float(np.sqrt(result.return_variance)),
-                yardstick=self.yardstick,
-            )
+            found = policy_return(self.model, policy, self.horizon, success=self.success)
+            rate, std = found.success_rate, float(np.sqrt(found.return_variance))
+            returns, lengths = np.array([found.expected_return]), np.array([found.expected_length])
+            successes = None if rate is None else np.array([rate])
+            return Evaluation(returns, lengths, successes, std, self.yardstick)
 
         return OfLastPolicy(worth)
 

@@ -42,12 +42,7 @@ from rl_yardstick.pipeline.spec import TrainSpec
 
 
 class Judge:
-    """Evaluates one agent, and tells why it is judged as it is.
-
-    Args:
-        spec: the training.
-        agent: the agent, on its training environments.
-        console: where remarks are printed.
+    """Evaluates one agent, and prints why it is judged as it is.
 
     Attributes:
         exact: the exact evaluator; None if episodes are sampled or histories followed.
@@ -224,13 +219,9 @@ def by_histories(spec: TrainSpec, agent: BaseAlgorithm, world: ExactEvaluator) -
         moments = np.stack([np.bincount(pairs, each) for each in moments])
         first_states = state[first[kept]]
         history, state = alike[history][places], state[places]
-    return Evaluation(
-        returns=totals[:1],
-        lengths=totals[2:3],
-        successes=None if world.success is None else totals[3:],
-        exact_std=float(np.sqrt(max(totals[1] - totals[0] ** 2, 0.0))),
-        yardstick=_scale_of_memory(world),
-    )
+    std = float(np.sqrt(max(totals[1] - totals[0] ** 2, 0.0)))
+    successes = None if world.success is None else totals[3:]
+    return Evaluation(totals[:1], totals[2:3], successes, std, _scale_of_memory(world))
 
 
 def _numbered(rows: NDArray[Any]) -> tuple[Ints, Ints]:

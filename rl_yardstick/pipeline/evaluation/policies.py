@@ -30,6 +30,7 @@ from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
 from rl_yardstick.agents.tabular.policy import QTablePolicy
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.finite_numbers import check_rows
 
 
 def is_of_library(module: str) -> bool:
@@ -63,27 +64,30 @@ def _parameters(predict: Callable[..., Any]) -> frozenset[str]:
     return frozenset(inspect.signature(predict).parameters)
 
 
-def player(model: BaseAlgorithm, env: VecEnv) -> Any:
-    """The agent, wrapped to receive masks from ``env`` if it takes action masks."""
-    if not takes_masks(model):
-        return model
-    try:
-        check_masks_exist(env)
-    except ValueError as error:
-        raise UserError(
-            f"{type(model).__name__} needs action masks, and the environment has none"
-        ) from error
-    return _Masked(model, env)
+class Player:
+    """An agent in environments: it is told action masks, and sees finite observations only.
 
+    Raises:
+        UserError: if it takes masks, and the environments have none.
+    """
 
-class _Masked:
-    def __init__(self, model: Any, env: VecEnv) -> None:
-        self.model, self.env = model, env
+    def __init__(self, model: BaseAlgorithm, env: VecEnv, when: str) -> None:
+        self.model, self.env, self.when = model, env, when
+        self.is_masked = takes_masks(model)
+        try:
+            if self.is_masked:
+                check_masks_exist(env)
+        except ValueError as error:
+            needs = f"{type(model).__name__} needs action masks, and the environment has none"
+            raise UserError(needs) from error
 
-    def predict(self, observation: Any, **kwargs: Any) -> Any:
-        """Predict with the current action masks of the environments."""
-        masks = present_masks(self.env, observation)
-        return self.model.predict(observation, action_masks=masks, **kwargs)
+    def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """Check the observation, then predict."""
+        check_rows(observation, "observation", self.when)
+        if self.is_masked:
+            kwargs["action_masks"] = present_masks(self.env, observation)
+        actions, state = self.model.predict(observation, **kwargs)
+        return actions, state
 
 
 Result = TypeVar("Result")

@@ -23,9 +23,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from rl_yardstick.envs.brackets import may_have_bracket, optimum_bracket
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.pipeline.evaluation.policies import is_network, player
+from rl_yardstick.pipeline.evaluation.policies import Player, is_network
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
-from rl_yardstick.pipeline.finite_numbers import FinitePlayer, check_numbers
+from rl_yardstick.pipeline.finite_numbers import check_numbers
 from rl_yardstick.pipeline.spec import TrainSpec
 
 
@@ -81,10 +81,6 @@ class Evaluation:
         """Share of successful episodes, if the environment reports success."""
         return None if self.successes is None else float(self.successes.mean())
 
-    def measured_by(self, yardstick: Yardstick | None) -> Evaluation:
-        """The same figures with another yardstick."""
-        return replace(self, yardstick=yardstick)
-
     def joined(self, more: Evaluation) -> Evaluation:
         """These sampled episodes together with further ones of the same agent."""
         both = None
@@ -124,7 +120,7 @@ def evaluate(
     when = f"in the evaluation at step {getattr(model, 'num_timesteps', 0):,}"
     if seed is not None:
         env.seed(seed)
-    watched: Any = FinitePlayer(player(model, env), when)
+    watched: Any = Player(model, env, when)
     returns, lengths = evaluate_policy(
         *(watched, env, n_episodes, deterministic),
         return_episode_rewards=True,
@@ -279,7 +275,7 @@ class SampledEvaluator:
             found = found.joined(play(n_more, None))
         self.n_steps += int(found.lengths.sum())
         self._last_length = found.mean_length
-        return found.measured_by(self.yardstick)
+        return replace(found, yardstick=self.yardstick)
 
     def _allowed(self, model: BaseAlgorithm, n_trained: float) -> float:
         is_compiled = self._compiled_copy(model) is not None

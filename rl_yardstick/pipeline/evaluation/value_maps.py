@@ -90,11 +90,6 @@ class ValueMapRecorder:
         self.moments: list[tuple[int, int, Floats, Ints]] = []
         self.stride, self.n_units = 1, 0  # evaluations, one in ``stride`` of which is kept
 
-    def can_record(self, agent: BaseAlgorithm) -> bool:
-        """Whether there are few states, and the agent has one action in each."""
-        is_small = self.evaluator.model.n_states <= MAX_STATES
-        return is_small and best_actions_of(self.evaluator, agent) is not None
-
     def count(self, agent: BaseAlgorithm) -> None:
         """Count an evaluation, and record its map if its number is a multiple of the stride."""
         self.n_units += 1
