@@ -106,7 +106,15 @@ def draw_learning_curve(
         style: Any = {"color": BLUE, "markersize": 4, "label": "evaluation, mean return"}
         judged.plot(list(evaluations), list(evaluations.values()), "o-", **style)
     if yardstick is not None:
-        _draw_yardstick(judged, yardstick)
+        most = "optimum, at most" if yardstick.is_proven else "optimum, at most (not proven)"
+        ends: dict[str, tuple[float | None, str]] = {
+            "optimum" if yardstick.at_least is None else most: (yardstick.optimum, "-"),
+            "optimum, at least": (yardstick.at_least, "--"),
+            "best random or constant policy": (yardstick.baseline, ":"),
+        }
+        for label, (height, dash) in ends.items():
+            if height is not None:
+                judged.axhline(height, color=GREEN, linestyle=dash, linewidth=1.2, label=label)
     judged.set_title(title, loc="left")
     for axes in panels.flat:
         _style(axes)
@@ -123,18 +131,6 @@ def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> Non
     if (width := min(MOVING_AVERAGE_EPISODES, len(returns))) > 1:
         smooth, label = moving_average(returns, width), f"{what}, mean of {width} episodes"
         axes.plot(steps[::stride], smooth[::stride], color=ORANGE, label=label)
-
-
-def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
-    most = "optimum, at most" if yardstick.is_proven else "optimum, at most (not proven)"
-    lines: dict[str, tuple[float | None, str]] = {
-        "optimum" if yardstick.at_least is None else most: (yardstick.optimum, "-"),
-        "optimum, at least": (yardstick.at_least, "--"),
-        "best random or constant policy": (yardstick.baseline, ":"),
-    }
-    for label, (height, style) in lines.items():
-        if height is not None:
-            axes.axhline(height, color=GREEN, linestyle=style, linewidth=1.2, label=label, zorder=1)
 
 
 def _style(axes: Axes) -> None:

@@ -71,7 +71,11 @@ def shade(colour: Colour) -> tuple[float, float, float]:
 
 BLACK = shade(INK)
 # A value below the scale.
-BELOW = {"facecolor": shade((222, 222, 222)), "edgecolor": shade((196, 196, 196)), "hatch": "////"}
+BELOW: Any = {
+    "facecolor": shade((222, 222, 222)),
+    "edgecolor": shade((196, 196, 196)),
+    "hatch": "////",
+}
 GROUND = {WALL: SHELF, GOAL: PALE_GREEN, TRAP: PALE_RED}
 # Marker, its size as a share of the cell, and its colour.
 MARKS = {GOAL: ("*", 0.55, GREEN), TRAP: ("X", 0.36, INK), PRIZE: ("D", 0.15, AMBER)}
@@ -183,11 +187,13 @@ def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) ->
 
 
 def draw_numbers(axes: Axes, policy: Policy, font: float, decimals: int) -> None:
-    """Write the values at the bottom of the cells, ``font`` points high."""
+    """Write the values, ``font`` points high; those from 10,000 on in thousands."""
     style: Any = {"fontsize": font, "ha": "center", "va": "center_baseline", "color": BLACK}
-    texts = [short_number(value, decimals) for value in policy.values[policy.matters]]
-    for x, y, text in zip(*policy.places(policy.matters), texts, strict=True):
-        axes.text(x, y + 0.29, text, in_layout=False, **style)
+    values = policy.values[policy.matters]
+    for x, y, value in zip(*policy.places(policy.matters), values, strict=True):
+        digits = 0 if abs(value) >= 99.5 else decimals
+        text = f"{value / 1e3:.0f}k" if abs(value) >= 9_999.5 else f"{value:z.{digits}f}"
+        axes.text(x, y + 0.29, text.replace("-", "\N{MINUS SIGN}"), in_layout=False, **style)
 
 
 def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
@@ -204,13 +210,6 @@ def return_number(value: float) -> str:
     """A return with four significant digits, as in the tables of a study."""
     text = f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.0f}"
     return text.replace("-", "\N{MINUS SIGN}")
-
-
-def short_number(value: float, decimals: int) -> str:
-    """A value with so many decimals, of which thousands have none and end in ``k``."""
-    size = abs(value)
-    text = f"{size / 1e3:.0f}k" if size >= 9_999.5 else f"{size:.{decimals * (size < 99.5)}f}"
-    return f"\N{MINUS SIGN}{text}" if value < 0 and text.strip("0.") else text
 
 
 # --- whole pictures: two maps side by side --------------------------------------------------------
@@ -281,18 +280,19 @@ def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar
     from matplotlib.cm import ScalarMappable
 
     found = sides[0].shown
-    layout, cell = found.layout, cell_inches(found.layout)
-    font = min(0.2 * 72 * cell, 9.0)
+    layout = found.layout
     # The layers that a policy reaches, those with the fewest prizes first.
     come_to = found.matters & (found.visited | found.optimal_visited)
     layers = np.unique(layout.layers[come_to]).tolist()
     layers = sorted(layers, key=lambda layer: (layer.bit_count(), layer))[:MAX_LAYERS]
-    figure, pairs = _panels(layout, len(layers), cell)
+    figure, pairs, cell = _panels(layout, len(layers))
     for axes, side in zip(pairs[0], sides, strict=True):
         axes.set_title(side.title, fontsize=10, loc="left")
     for pair, layer in zip(pairs, layers, strict=True):
         if layout.prizes:
-            pair[0].set_ylabel(layer_name(layout, layer))
+            places = [layout.place_name(place) for place in layout.collected_in(layer)]
+            collected = f"{layout.names.get(PRIZE, 'prize')} collected at {'; '.join(places)}"
+            pair[0].set_ylabel(collected if places else "nothing collected")
     source = ScalarMappable(explained.scale, explained.colours)
     colour_bar = figure.colorbar(source, ax=figure.axes, aspect=30, pad=0.02)
     colour_bar.set_label(bar)
@@ -306,26 +306,14 @@ def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar
         for axes, side in zip(pair, sides, strict=True):
             policy = policies_in(side.shown, layer)[side.which]
             draw_ground(axes, policy, side.scale, side.colours)
-            draw_marks(axes, policy, 72 * cell)
-            width = min(2.9 / (72 * cell), 0.085) * (0.5 if side.which else 1)
+            draw_marks(axes, policy, cell)
+            font = min(0.2 * cell, 9.0)
+            width = min(2.9 / cell, 0.085) * (0.5 if side.which else 1)
             draw_arrows(axes, policy, width, with_numbers=font >= SMALLEST_FONT)
             if font >= SMALLEST_FONT:
                 draw_numbers(axes, policy, font, side.decimals)
-            mark_differing(axes, policy, 72 * cell)
+            mark_differing(axes, policy, cell)
     write_png(figure, path)
-
-
-def layer_name(layout: GridLayout, layer: int) -> str:
-    """The collected prizes of a layer, in words."""
-    places = [layout.place_name(cell) for cell in layout.collected_in(layer)]
-    found = f"{layout.names.get(PRIZE, 'prize')} collected at {'; '.join(places)}"
-    return found if places else "nothing collected"
-
-
-def cell_inches(layout: GridLayout) -> float:
-    """The width of a cell that makes small maps readable and lets large ones fit on a screen."""
-    longest, is_wide = max(layout.n_rows, layout.n_columns), layout.n_columns >= 2 * layout.n_rows
-    return min(max(0.5 * longest, 3.2), 9.0 if is_wide else 7.0) / longest
 
 
 def decimals_for(found: ValueMap) -> int:
@@ -339,18 +327,20 @@ def decimals_for(found: ValueMap) -> int:
     return 2 if np.ptp(best) < 10 else 1
 
 
-def _panels(layout: GridLayout, n_layers: int, cell: float) -> tuple[Figure, list[list[Axes]]]:
-    """Make a figure with two empty panels for each layer, cells ``cell`` inches wide."""
+def _panels(layout: GridLayout, n_layers: int) -> tuple[Figure, list[list[Axes]], float]:
+    """Make a figure with two empty panels for each layer; also the width of a cell in points."""
     from matplotlib.figure import Figure
 
+    longest = max(layout.n_rows, layout.n_columns)
     is_wide = layout.n_columns >= 2 * layout.n_rows  # panels are then stacked
+    # In inches: small maps are readable, and large ones fit on a screen.
+    cell = min(max(0.5 * longest, 3.2), 9.0 if is_wide else 7.0) / longest
     n_rows, n_columns = (2 * n_layers, 1) if is_wide else (n_layers, 2)
     width = n_columns * (cell * layout.n_columns + 0.3) + MARGIN
     height = n_rows * (cell * layout.n_rows + 0.35) + MARGIN
     figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
     panels = figure.subplots(n_rows, n_columns, squeeze=False)
     right, bottom = layout.n_columns - 0.5, layout.n_rows - 0.5
-    longest = max(layout.n_rows, layout.n_columns)
     # Drawing labels takes more time than everything else.
     step = next(step for step in (1, 2, 5, 10, longest) if longest <= MAX_TICKS * step)
     for number, axes in enumerate(panels.flat):
@@ -362,7 +352,7 @@ def _panels(layout: GridLayout, n_layers: int, cell: float) -> tuple[Figure, lis
             axis.set_ticks(shown, [str(place + 1) for place in shown])
         axes.tick_params(length=0, labelsize=7, labelcolor=DIM, pad=2)
         axes.spines[:].set_visible(False)
-    return figure, panels.reshape(-1, 2).tolist()
+    return figure, panels.reshape(-1, 2).tolist(), 72 * cell
 
 
 def _legend(found: ValueMap, scale: Normalize) -> Iterator[Artist]:

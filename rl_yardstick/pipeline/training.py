@@ -168,7 +168,9 @@ class Parts:
             critics = found if not isinstance(found, str) else None
             if critics is None:
                 run.console.print(f"no diagnosis: {found}", style="dim", markup=False)
-        maps = None if exact is None else ValueMapRecorder(run.path / "value_maps.npz", exact)
+        maps = None
+        if exact is not None and (spec.watch_learning or exact.layout is not None):
+            maps = ValueMapRecorder(run.path / "value_maps.npz", exact)
         evaluator, eval_env = self.judge.evaluator, self.judge.env
         self.evaluation = EvaluationCallback(run, eval_env, evaluator, frequencies, maps, critics)
         self.watch = watch_of(spec, self.agent, maps)

@@ -22,7 +22,7 @@ from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
-from rl_yardstick.pipeline.evaluation.yardstick import FAILED, NEARLY_ALL
+from rl_yardstick.pipeline.evaluation.yardstick import FAILED
 from rl_yardstick.pipeline.settings import shipped_hyperparams
 from rl_yardstick.pipeline.spec import TrainSpec
 
@@ -38,7 +38,7 @@ MATTERS = 0.05
 # Planning with this many states x actions x outcomes takes about a second.
 MOST_OUTCOMES = 500_000
 # An episode is stuck in a few states if it spends nearly all of its last steps there.
-LAST_STEPS = 100
+LAST_STEPS, NEARLY_ALL = 100, 0.99
 MOST_STATES_NAMED = 3
 
 
@@ -81,10 +81,8 @@ def still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats
     model, horizon = evaluator.model, evaluator.horizon
     visits = state_visitation(model, policy, horizon)
     if n_last < horizon:
-        has_time = (
-            policy.ndim == 2 and len(policy) == horizon and policy.shape != model.prob.shape[:2]
-        )
-        before = policy[: horizon - n_last] if has_time and len(policy) > 1 else policy
+        has_time = policy.ndim == 2 and policy.shape != model.prob.shape[:2]
+        before = policy[: horizon - n_last] if has_time and len(policy) == horizon > 1 else policy
         visits = visits - state_visitation(model, before, horizon - n_last)
     return np.maximum(visits, 0.0)
 
@@ -125,7 +123,9 @@ def _try_first(
         return None
     is_near = share_of_standing_still(agent, model, observations, gamma) >= NEAR_STANDING_STILL
     nearer = max(1 - 0.5 / evaluator.horizon, gamma)
-    score, reached = (_planned(evaluator, model, discount) for discount in (gamma, nearer))
+    plans = [value_iteration(model, discount).policy for discount in (gamma, nearer)]
+    found = [policy_return(evaluator.model, plan, evaluator.horizon) for plan in plans]
+    score, reached = (evaluator.yardstick.score(each.expected_return) for each in found)
     raises_gamma = nearer > gamma and (is_near or score < reached - MATTERS)
     n_tables = len(getattr(agent.policy, "q_tables", [0]))
     n_pairs = int(model.reachable.sum()) * model.n_actions * n_tables
@@ -148,13 +148,6 @@ def _try_first(
         if score < reached - MATTERS:
             now[-1] += f", where even exact planning scores {score:.2f}"
     return f"{' '.join(flags)} (now {'; '.join(now)})"
-
-
-def _planned(evaluator: ExactEvaluator, model: TransitionModel, gamma: float) -> float:
-    """The score of the policy that is optimal under a discount."""
-    plan = value_iteration(model, gamma)
-    found = policy_return(evaluator.model, plan.policy, evaluator.horizon)
-    return evaluator.yardstick.score(found.expected_return)
 
 
 def share_of_standing_still(

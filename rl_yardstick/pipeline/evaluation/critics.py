@@ -160,11 +160,7 @@ def learns_exploring_values(spec: TrainSpec, agent: BaseAlgorithm) -> bool:
 class CriticRecorder(BlockCallback):
     """Writes ``diagnosis.csv``: a row for each comparison of the agent.
 
-    Args:
-        path: the file.
-        world: the environment that the agent trains on.
-        explores: whether the agent learns the values of its exploring policy, else those of its
-            greedy policy.
+    With ``explores``, the agent learns the values of its exploring policy, not of its greedy one.
     """
 
     def __init__(self, path: Path, world: KnownWorld, *, explores: bool) -> None:
@@ -289,18 +285,11 @@ class RolloutRecorder(CriticRecorder):
         if world.is_limited:
             n_left = np.minimum(n_left, world.horizon - (times - begun))
         assert critic is not None
-        steps = states, actions, n_left.reshape(-1)
-        expected, shared = expected_estimates(
-            world.model, policy, critic, agent.gamma, agent.gae_lambda, steps
-        )
-        ones = np.ones(len(states))
-        found = {
-            "gae_bias": root_mean_square(
-                expected - shared - exact.advantages[states, actions], ones
-            ),
-            "gae_offset": root_mean_square(shared, ones),
-            "gae_std": root_mean_square(estimates - expected, ones),
-        }
+        discounts, steps = (agent.gamma, agent.gae_lambda), (states, actions, n_left.reshape(-1))
+        expected, shared = expected_estimates(world.model, policy, critic, *discounts, steps)
+        biases, ones = expected - shared - exact.advantages[states, actions], np.ones(len(states))
+        errors = {"gae_bias": biases, "gae_offset": shared, "gae_std": estimates - expected}
+        found = {name: root_mean_square(values, ones) for name, values in errors.items()}
         visits = world.visits(policy)[:, None]
         true = np.where((visits > 0) & (policy > 0), visits * policy * exact.advantages, 0.0)
         if np.isfinite(true).all():
@@ -361,8 +350,7 @@ def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> 
     parameters = [p for p in policy.parameters() if p.requires_grad]
     found = []
     for weight in th.as_tensor(weights, dtype=logs.dtype, device=logs.device):
-        slopes: Any = th.autograd.grad(
-            logs, parameters, weight, retain_graph=True, allow_unused=True
-        )
+        kept: Any = {"retain_graph": True, "allow_unused": True}
+        slopes: Any = th.autograd.grad(logs, parameters, weight, **kept)
         found.append(th.cat([slope.reshape(-1) for slope in slopes if slope is not None]))
     return np.asarray(th.stack(found).double().cpu().numpy())
