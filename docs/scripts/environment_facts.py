@@ -39,7 +39,7 @@ from rl_yardstick.mdp import (
 )
 from rl_yardstick.mdp.beliefs import Bracket
 from rl_yardstick.mdp.evaluation import PolicyReturn
-from rl_yardstick.pipeline.evaluation.observability import HiddenScale, hidden_scale
+from rl_yardstick.pipeline.evaluation.exact import HiddenScale, hidden_scale
 from rl_yardstick.pipeline.settings import entry_names, parse_assignments
 
 PAGES = Path(__file__).resolve().parents[1] / "environments"

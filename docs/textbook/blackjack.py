@@ -149,7 +149,7 @@ def learnt(n_episodes: int) -> Ints:
 def best_policy(n_episodes: int) -> tuple[Figure, list[Statement]]:
     """Figure 5.2."""
     shown, blackjack, actions = observations(), model(), learnt(n_episodes)
-    best = finite_horizon_optimum(blackjack, LONGEST).actions(0)[: len(actions)].astype(np.int64)
+    best = finite_horizon_optimum(blackjack, LONGEST).policy[0, : len(actions)].astype(np.int64)
     figure = Figure(figsize=(8, 6.4), layout="constrained")
     for axes, (title, policy) in zip(
         figure.subplots(2, 2).T, {"learnt": actions, "optimal": best}.items(), strict=True

@@ -67,7 +67,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--no-render", action="store_const", const="none", dest="render", help="--render none")
     pace = f"pictures a second of --render ansi on a terminal (default: {FRAMES_PER_SECOND})"
     add("--fps", type=whole_number(1, 60), metavar="N", help=pace)
-    add("--record", type=filled, metavar="FILE", help="write a film, .gif or .mp4")
+    add("--record", type=filled, metavar="FILE", help="write a film, .gif")
     add("--reward-log", metavar="DIR", help="also write the returns there, as Monitor's CSV files")
     add("--verbose", type=VERBOSITY, default=1, help="0 for no output (default: 1)")
     add("--norm-reward", action="store_true", help="returns of normalised rewards, as in training")
@@ -218,16 +218,15 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
     from rl_yardstick.pipeline.evaluation.sampled import Evaluation, bracketed_yardstick
 
     returns, lengths = np.array(show.played, dtype=np.float64).T
-    played = Evaluation(returns, lengths, None)
-    if not is_normalised:
-        played = played.measured_by(bracketed_yardstick(spec))
+    yardstick = None if is_normalised else bracketed_yardstick(spec)
+    played = Evaluation(returns, lengths, None, yardstick=yardstick)
     return result_lines(played, f"length {figures(played.mean_length)[0]}")
 
 
 def expected_return(spec: TrainSpec, agent: Any, deterministic: bool) -> Evaluation | str | None:
     """The policy's exact evaluation; or a line on why figures are sampled; None if unknown."""
     from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
-    from rl_yardstick.pipeline.evaluation.histories import by_histories, world_of_memory
+    from rl_yardstick.pipeline.evaluation.judge import by_histories, world_of_memory
     from rl_yardstick.pipeline.evaluation.policies import why_not_exact
 
     world = world_of_memory(spec, agent) if deterministic else None

@@ -174,15 +174,14 @@ def course_of(one: Asked, last: Explanation) -> dict[int, Explanation]:
 
 def draw(one: Asked, explained: Explanation, path: Path) -> None:
     """Draw the cost of each cell."""
-    from rl_yardstick.pipeline.evaluation.value_maps import map_refusal, value_map
-    from rl_yardstick.pipeline.map_pictures import draw_cost_map
+    from rl_yardstick.pipeline.evaluation.value_maps import MAX_STATES, value_map
+    from rl_yardstick.pipeline.pictures import draw_cost_map
 
     if path.suffix != ".png":
         raise UserError(f"--map writes a .png, not {path}")
     found = value_map(one.evaluator, one.agent)
     if found is None:
-        reason = map_refusal(one.evaluator) or "only grid worlds have a map"
-        raise UserError(f"--map: {reason}")
+        raise UserError(f"--map: only grid worlds of up to {MAX_STATES:,} states have a map")
     spec = one.found.spec
     draw_cost_map(path, f"{spec.algo} on {spec.place}", found, explained.losses)
 

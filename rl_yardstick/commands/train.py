@@ -396,7 +396,7 @@ def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Outcome)
     say(console, "")
     for label, command in next_commands(spec, run, outcome):
         say(console, f"{label:<9}{command}")  # however long, so that it can be copied
-    if outcome.watch is not None and spec.watch_learning is not None and outcome.watch.has_begun:
+    if outcome.watch is not None and spec.watch_learning is not None:
         from rl_yardstick.report.page.learning import write_learning_page
 
         with console.status("writing the page that plays the training"):

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
 from rl_yardstick.agents.planning import PlanningAgent
 from rl_yardstick.agents.reference import RandomAgent
 from rl_yardstick.diagnosis.proposals import proposals
@@ -52,7 +53,7 @@ from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.advice import how_episodes_end, still_running
 from rl_yardstick.pipeline.evaluation.critics import learns_exploring_values
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
-from rl_yardstick.pipeline.evaluation.policies import believed_values
+from rl_yardstick.pipeline.evaluation.policies import own_values
 from rl_yardstick.pipeline.spec import TrainSpec
 
 MOST_OUTCOMES = (
@@ -248,7 +249,9 @@ class Found:
         self.groups = None
         if evaluator.scale is not None:
             self.groups = observation_groups(evaluator.observations, self.model.reachable)
-        self.beliefs = believed_values(agent, evaluator.observations)
+        self.beliefs: Floats | None = None  # a softmax does not act by its values
+        if not isinstance(agent, SoftmaxAlgorithm):
+            self.beliefs = own_values(agent, evaluator.observations)
         # how often each pair of state and action of a table was updated, shape (S, A)
         self.updates: Ints | None = None
         counts = getattr(agent.policy, "visit_counts", None)

@@ -528,7 +528,7 @@ def _failed_runs(
 def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]:
     """The advice on the agent of each run; None for a run without advice."""
     from rl_yardstick.pipeline.evaluation.advice import advice
-    from rl_yardstick.pipeline.evaluation.exact import evaluator_of
+    from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
     from rl_yardstick.pipeline.models import load_agent, model_of_run
 
     answers: list[tuple[str, str | None] | None] = []
@@ -536,7 +536,7 @@ def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]
         found, spec = None, planned.spec
         with suppress(UserError, OSError):
             import_modules(spec.gym_packages)
-            evaluator, agent = evaluator_of(spec), load_agent(model_of_run(planned.run))
+            evaluator, agent = exact_evaluator(spec), load_agent(model_of_run(planned.run))
             if evaluator is not None and not evaluator.obstacle(agent):
                 n_steps = int(planned.recorded()["n_timesteps"])
                 found = advice(spec, agent, evaluator, evaluator(agent), n_steps)

@@ -377,9 +377,9 @@ class EvaluationCallback(EvalCallback):
         if not 0 <= time.monotonic() - self._written_at < SECONDS_BETWEEN_WRITES:
             self.write()
         if self.value_maps is not None:
-            self.value_maps.record(self.model, self.num_timesteps)
+            self.value_maps.count(self.model)
         if self.critics is not None:
-            self.critics.judge(self.num_timesteps, self.episodes_seen)
+            self.critics.judge(self.num_timesteps)
         self._log(found)
         if found.mean_return > self.best_mean_reward:
             self.best_mean_reward = found.mean_return

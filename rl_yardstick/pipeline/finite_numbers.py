@@ -87,20 +87,6 @@ def _is_finite_tensor(tensor: th.Tensor) -> bool:
     return not tensor.is_floating_point() or bool(th.isfinite(tensor).all())
 
 
-class FinitePlayer:
-    """Wraps an agent, and refuses observations that are not finite."""
-
-    def __init__(self, player: Any, when: str) -> None:
-        self._player = player
-        self._when = when
-
-    def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """Check the observation, then predict."""
-        check_rows(observation, "observation", self._when)
-        actions, state = self._player.predict(observation, **kwargs)
-        return actions, state
-
-
 def _parts(values: Any) -> Iterator[tuple[str, NDArray[Any]]]:
     """The arrays among values, each with its name for messages."""
     if isinstance(values, Mapping):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import importlib.util
 import io
 import os
 import warnings
@@ -35,12 +33,8 @@ def playing_env(
 ) -> VecEnv:
     """Make the VecEnv for playing.
 
-    Args:
-        model: the model to play.
-        mode: the render mode; `FrameTaker` returns the frames of ``ansi`` and ``rgb_array``.
-        n_envs: environments in it.
-        monitor_folder: where Monitors write.
-        norm_reward: whether returns are sums of normalised rewards, as in training.
+    `FrameTaker` returns the frames of the modes ``ansi`` and ``rgb_array``. With ``norm_reward``,
+    returns are sums of normalised rewards, as in training.
     """
     if mode == "rgb_array":
         # Rendering into memory needs no display, but SDL complains if there is none.
@@ -90,10 +84,10 @@ def play_episodes(
     Yields:
         Return and length of each episode as it ends.
     """
-    from rl_yardstick.pipeline.evaluation.policies import player
-    from rl_yardstick.pipeline.finite_numbers import FinitePlayer, check_numbers
+    from rl_yardstick.pipeline.evaluation.policies import Player
+    from rl_yardstick.pipeline.finite_numbers import check_numbers
 
-    choose = FinitePlayer(player(model, env), "while it is played").predict
+    choose = Player(model, env, "while it is played").predict
     obs: Any = env.reset()
     state = None
     starts = np.ones(env.num_envs, dtype=bool)
@@ -134,18 +128,15 @@ class FrameTaker:
 
 # --- films ----------------------------------------------------------------------------------------
 
-FILM_SUFFIXES = (".gif", ".mp4")
 FRAMES_PER_SECOND = 10
 
 
 def check_film_path(path: Path) -> None:
     """Check that a film can be written, before anything is played."""
-    if path.suffix not in FILM_SUFFIXES:
-        raise UserError(f"--record writes {' or '.join(FILM_SUFFIXES)} files, not {path.name!r}")
+    if path.suffix != ".gif":
+        raise UserError(f"--record writes .gif files, not {path.name!r}")
     if not path.absolute().parent.is_dir():
         raise UserError(f"--record: there is no folder {path.parent}")
-    if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise UserError("--record to .mp4 needs: pip install 'rl-yardstick[video]'")
 
 
 def film_episode(
@@ -153,22 +144,15 @@ def film_episode(
 ) -> tuple[list[Any], tuple[float, int] | None]:
     """Play an episode; returns its frames, and return and length, None if it did not end."""
     taker, frames = FrameTaker(env), list[Any]()
-    played = play_episodes(
-        model,
-        env,
-        1,
-        max_steps,
-        deterministic=deterministic,
-        after_step=lambda done: frames.extend(taker.take(done)),
-    )
+    kept: Any = {"after_step": lambda done: frames.extend(taker.take(done))}
+    played = play_episodes(model, env, 1, max_steps, deterministic=deterministic, **kept)
     return frames, next(played, None)
 
 
 def write_film(path: Path, frames: list[Any]) -> None:
-    """Write frames, uint8 of shape (height, width, 3), as a film: .mp4, and else GIF."""
-    film = _as_mp4(frames) if path.suffix == ".mp4" else as_gif(frames)
+    """Write frames, uint8 of shape (height, width, 3), as a GIF."""
     with replacing(path) as beside:
-        beside.write_bytes(film)
+        beside.write_bytes(as_gif(frames))
 
 
 def as_gif(frames: list[Any]) -> bytes:
@@ -179,17 +163,3 @@ def as_gif(frames: list[Any]) -> bytes:
     duration, film = 1000 // FRAMES_PER_SECOND, io.BytesIO()
     first.save(film, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
     return film.getvalue()
-
-
-def _as_mp4(frames: list[Any]) -> bytes:
-    import imageio.v2 as imageio
-
-    # Encoders need even side lengths.
-    even = [frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]
-    film: bytes = imageio.mimwrite(
-        "<bytes>", even, format="mp4", fps=FRAMES_PER_SECOND, macro_block_size=1
-    )
-    # The library uses a temporary file, and does not report a full disk.
-    if b"moov" not in film:
-        raise OSError(errno.EIO, "the encoder wrote no whole film: is the disk full?")
-    return film

@@ -51,7 +51,7 @@ from rl_yardstick.pipeline.pictures import draw
 from rl_yardstick.pipeline.progress import ProgressCallback
 from rl_yardstick.pipeline.run import FAILED, FINISHED, INTERRUPTED, Run
 from rl_yardstick.pipeline.spec import TrainSpec
-from rl_yardstick.pipeline.watching import EvaluationMaps, Watch, watch_of
+from rl_yardstick.pipeline.watching import Watch, watch_of
 
 # What libraries raise for settings that they cannot work with.
 REFUSALS = (ValueError, TypeError, AssertionError, RuntimeError, MemoryError)  # of constructors
@@ -168,10 +168,12 @@ class Parts:
             critics = found if not isinstance(found, str) else None
             if critics is None:
                 run.console.print(f"no diagnosis: {found}", style="dim", markup=False)
-        maps = None if exact is None else ValueMapRecorder(run.path / "value_maps.npz", exact)
+        maps = None
+        if exact is not None and (spec.watch_learning or exact.layout is not None):
+            maps = ValueMapRecorder(run.path / "value_maps.npz", exact)
         evaluator, eval_env = self.judge.evaluator, self.judge.env
         self.evaluation = EvaluationCallback(run, eval_env, evaluator, frequencies, maps, critics)
-        self.watch = watch_of(spec, self.agent, exact)
+        self.watch = watch_of(spec, self.agent, maps)
         self.pulls = self._pull_recorder()
         self.clock = Clock()
         self.progress = ProgressCallback(
@@ -194,9 +196,7 @@ class Parts:
         Numbers are checked before anything keeps them, and a saved state is put back before any
         other callback acts.
         """
-        spec, run, watch = self.spec, self.run, self.watch
-        if isinstance(watch, EvaluationMaps):
-            self.evaluation.callback, watch = watch, None
+        spec, run = self.spec, self.run
         with_buffer = spec.save_replay_buffer
         others: list[BaseCallback | None] = [
             *(self._of_settings()),
@@ -204,7 +204,7 @@ class Parts:
             EpisodeCheckpoint(run, spec.save_every_n_episodes, with_buffer)
             if spec.save_every_n_episodes > 0
             else None,
-            *(self.pulls, self.evaluation.critics, watch, self.evaluation),
+            *(self.pulls, self.evaluation.critics, self.watch, self.evaluation),
             EpisodeBudget(spec.n_episodes) if spec.n_episodes is not None else None,
             *(self.clock, self.progress),
         ]
@@ -274,7 +274,7 @@ class Parts:
                 evaluation.evaluate()
             evaluation.write()
             if evaluation.value_maps is not None:
-                evaluation.value_maps.finish(agent, agent.num_timesteps)
+                evaluation.value_maps.finish(agent)
             if evaluation.critics is not None:
                 evaluation.critics.finish(agent.num_timesteps)
             evaluation.take_statistics()
@@ -293,7 +293,7 @@ class Parts:
             getattr(evaluation.evaluator, "n_steps", 0),
             getattr(agent, "engine_in_use", None),
             summarise_pulls(self.pulls.arrays()) if self.pulls is not None and pulled else None,
-            self.watch,
+            self.watch or (evaluation.value_maps if self.spec.watch_learning else None),
             self._advice(final),
             self.judge.exact is not None,
         )

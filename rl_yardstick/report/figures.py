@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,11 +29,11 @@ from matplotlib.transforms import offset_copy
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis
 from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, file_name
 from rl_yardstick.mdp.transition_model import Floats, Ints
-from rl_yardstick.pipeline.curve_pictures import DWARFED, symlog_ticks
 from rl_yardstick.pipeline.files import replacing
 from rl_yardstick.report.series import (
     COLOURS,
     DASHES,
+    DWARFED,
     SPREAD,
     ArmSeries,
     Belief,
@@ -433,6 +434,18 @@ def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
         axes.plot(curve.x, curve.y, label=agent, linewidth=1.5, marker=marker, **style)
         if place < MOST_BANDS:
             fill_band(axes, curve, marks[agent])
+
+
+MOST_POWERS = 12  # powers of ten on an axis
+
+
+def symlog_ticks(linear_up_to: float) -> list[float]:
+    """Ticks of a symmetric logarithmic axis: 0, one in the linear part, two for each power."""
+    power = math.floor(math.log10(linear_up_to))
+    within = max(m for m in (1, 2, 5) if m * 10.0**power <= linear_up_to) * 10.0**power
+    beyond = [m * 10.0**k for k in range(power, power + MOST_POWERS) for m in (1, 3)]
+    sizes = [within, *(size for size in beyond if size > linear_up_to)]
+    return [-size for size in reversed(sizes)] + [0.0, *sizes]
 
 
 def _set_scale(axes: Axes, linear_up_to: float | None) -> str:

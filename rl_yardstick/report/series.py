@@ -26,9 +26,11 @@ from rl_yardstick.experiments.results import (
 )
 from rl_yardstick.experiments.study import AgentSpec, StudySpec, symbol
 from rl_yardstick.mdp.transition_model import Floats, Ints
-from rl_yardstick.pipeline.curve_pictures import DWARFED
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.verdicts import UNBOUNDED, Bounds, Estimate
+
+# From this ratio on, the largest values flatten the rest of a linear axis: two decades.
+DWARFED = 100
 
 # Okabe and Ito's palette, which is safe for colour-blind readers. The page's style sheet repeats
 # it, and has another one for the dark theme.

@@ -70,7 +70,7 @@ def whys_of(runs: Sequence[PlannedRun]) -> list[Why | None]:
     Call this in a child process: it loads PyTorch.
     """
     from rl_yardstick.diagnosis.explanation import explanation
-    from rl_yardstick.pipeline.evaluation.exact import evaluator_of
+    from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
     from rl_yardstick.pipeline.models import load_agent, model_of_run
 
     told: list[Why | None] = []
@@ -78,7 +78,7 @@ def whys_of(runs: Sequence[PlannedRun]) -> list[Why | None]:
         told.append(None)
         with suppress(UserError, OSError):
             import_modules(run.spec.gym_packages)
-            if (evaluator := evaluator_of(run.spec)) is not None:
+            if (evaluator := exact_evaluator(run.spec)) is not None:
                 found = explanation(run.spec, load_agent(model_of_run(run.run)), evaluator)
                 told[-1] = Why(why_lines(found), next(map(as_words, found.proposals), None))
     return told

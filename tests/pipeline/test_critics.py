@@ -62,7 +62,7 @@ class TwoStates(gym.Env):
 def compared(algo, table, *, explores, **arguments):
     agent = agent_of(algo, DummyVecEnv([TwoStates]), gamma=0.5, **arguments)
     agent.policy.q_tables[:] = th.tensor(table, dtype=th.float64)
-    recorder = CriticRecorder(None, chain_world(), spec_of(algo), explores=explores)
+    recorder = CriticRecorder(None, chain_world(), explores=explores)
     recorder.model = agent
     return recorder.figures()
 
@@ -135,7 +135,7 @@ def on_corridor(env_id, algo="ppo", limit=50, **settings):
     settings = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 256, "gamma": 0.9, **settings}
     agent = agent_of(algo, env, device="cpu", **settings)
     world = known_world(spec, agent)
-    recorder = RolloutRecorder(None, world, spec, explores=True)
+    recorder = RolloutRecorder(None, world, explores=True)
     recorder.model = agent
     return agent, world, recorder
 
@@ -287,9 +287,6 @@ def test_a_state_without_advantages_counts_by_what_was_estimated_there(corridor_
 def test_the_agent_is_the_same_to_the_last_bit_and_figures_those_of_a_run_that_was_cut_off(
     tmp_path, monkeypatch, algo, settings, eval_freq, column
 ):
-    """Without ``eval_freq`` not every evaluation is compared."""
-    monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 2e-3)
-    monkeypatch.setattr(critics, "SECONDS_OF_NETWORKS", 5e-2)
     monkeypatch.setattr(StateCallback, "share_of_time", 1e9)
     monkeypatch.setattr(StateCallback, "shortest_pause", 0.0)
     spec = resumable(LAKE, algo, 400, settings, eval_freq=eval_freq)
@@ -319,16 +316,9 @@ def test_where_it_cannot_be_done_a_line_says_so(tmp_path):
     parts.close()
 
 
-def test_comparisons_are_thinned_out_evenly_and_by_no_clock(tmp_path, monkeypatch):
-    monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 0.0)
-    monkeypatch.setattr(critics, "SHARE", 1.0)
-    monkeypatch.setattr(critics, "seconds_per_step", lambda _: 1e-3)
-    monkeypatch.setattr(critics, "seconds_of_comparison", lambda *_, **__: 0.39)
-    spec = resumable(LAKE, "qlearning", 2000, {}, diagnose=True)
-    steps = [row["timesteps"] for row in rows_of(run_of(spec, tmp_path)[0])]
-    assert steps == [400, 800, 1200, 1600, 2000]  # of 20 evaluations
-    each = resumable(LAKE, "qlearning", 500, {}, diagnose=True, eval_freq=50)
-    assert len(rows_of(run_of(each, tmp_path)[0])) == 10
+def test_each_evaluation_is_compared(tmp_path):
+    spec = resumable(LAKE, "qlearning", 500, {}, diagnose=True, eval_freq=50)
+    assert len(rows_of(run_of(spec, tmp_path)[0])) == 10
 
 
 def test_where_states_look_alike_values_are_compared_and_rollouts_are_not():

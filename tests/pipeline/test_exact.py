@@ -11,10 +11,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.mdp import policy_return, value_iteration
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
-from rl_yardstick.pipeline.evaluation import histories, policies
+from rl_yardstick.pipeline.evaluation import judge, policies
 from rl_yardstick.pipeline.evaluation.advice import advice
 from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
-from rl_yardstick.pipeline.evaluation.histories import by_histories, world_of_memory
+from rl_yardstick.pipeline.evaluation.judge import by_histories, world_of_memory
 from rl_yardstick.pipeline.evaluation.policies import action_figures, policy_matrix
 from rl_yardstick.pipeline.evaluation.sampled import evaluate
 from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick, with_memory
@@ -471,7 +471,7 @@ def test_who_counts_readings_reaches_the_optimum_of_memory():
 
 def test_histories_that_an_agent_does_not_tell_apart_are_one(monkeypatch):
     # Ten steps: 2^10 sequences of sounds and more, but few counts.
-    monkeypatch.setattr(histories, "MOST_HISTORIES", 10)
+    monkeypatch.setattr(judge, "MOST_HISTORIES", 10)
     found = worth(Counting(), TIGER)
     # By hand, by how much more often the tiger was heard where it is; opening begins anew.
     total, counts = 0.0, {0: 1.0}

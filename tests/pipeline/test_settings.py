@@ -17,7 +17,6 @@ from rl_yardstick.pipeline.arguments import read_signature
 from rl_yardstick.pipeline.components import constructor_arguments
 from rl_yardstick.pipeline.environments import check_fit, make_single_env
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.evaluation.exact import discount_note, exact_evaluator
 from rl_yardstick.pipeline.settings import (
     HYPERPARAMS,
     SPECIAL,
@@ -316,7 +315,7 @@ def test_what_is_asked_for_wins_over_an_entrys_variant_for_training():
         assert bool(told) == is_told
 
 
-# --- what ``auto`` stands for, and what a discount costs ------------------------------------------
+# --- what ``auto`` stands for ---------------------------------------------------------------------
 
 CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": "auto"}}
 SCALE = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": "auto"}}
@@ -377,23 +376,6 @@ def test_what_cannot_be_worked_out_is_refused(env_id, raw, said, monkeypatch):
     gym.register("Unknown-v0", Unknown)
     with pytest.raises(UserError, match=said):
         read_spec("qlearning", env_id, {"n_timesteps": 10, **raw})
-
-
-@pytest.mark.parametrize(
-    ("slip", "gamma", "note"),
-    [
-        (
-            0.2,
-            0.99,
-            "at gamma 0.99 even exact planning scores 0.00 here; 0.9995: 1.00 (gamma: auto)",
-        ),
-        (0.2, 0.9995, None),
-        (0.0, 0.5, None),  # the shortest way is the best at any discount
-    ],
-)
-def test_what_a_discount_costs_is_planned_exactly(slip, gamma, note):
-    spec = spec_of("qlearning", "Warehouse-v0", env_kwargs={"slip": slip})
-    assert discount_note(spec, exact_evaluator(spec), gamma) == note
 
 
 def test_paths_of_maps_do_not_reach_a_run(tmp_path, monkeypatch):

@@ -6,7 +6,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from rich.console import Console
 
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation import sampled
@@ -160,12 +159,9 @@ def test_what_only_the_constructor_knows_is_one_line_and_leaves_no_folder(algo, 
 # --- what is printed and drawn --------------------------------------------------------------------
 
 
-def test_remarks_and_pictures(monkeypatch):
-    console = Console(record=True, width=200, force_terminal=False)
-    spec = spec_of("qlearning", LAKE, {"gamma": 0.5}, n_timesteps=2000, diagnose=True)
-    run, outcome = run_of(spec.changed(pictures=True), console=console)
-    text = console.export_text()
-    assert "at gamma 0.5 even exact planning scores" in text
+def test_pictures():
+    spec = spec_of("qlearning", LAKE, n_timesteps=2000, diagnose=True)
+    run, outcome = run_of(spec.changed(pictures=True))
     assert outcome.can_be_explained
     for name in ("learning_curve.png", "value_map.png", "diagnosis.png"):
         assert (run.path / name).stat().st_size > 5000

@@ -8,13 +8,12 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
 from matplotlib.figure import Figure
 from rich.console import Console
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
-from rl_yardstick.pipeline import map_pictures as drawing
+from rl_yardstick.pipeline import pictures as drawing
 from rl_yardstick.pipeline import progress, watching
 from rl_yardstick.pipeline.curve_pictures import read_monitors
 from rl_yardstick.pipeline.environments import make_training_env
@@ -22,8 +21,6 @@ from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.value_maps import value_map
 from rl_yardstick.pipeline.progress import ProgressCallback
-from rl_yardstick.pipeline.settings import override, read_entry, read_spec
-from rl_yardstick.pipeline.training import make_agent
 from rl_yardstick.pipeline.watching import TERMINATED, TableRecorder
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, run_of, spec_of, trained
 
@@ -46,9 +43,9 @@ def test_targets_are_those_of_the_rule_to_the_last_bit(engine):
     agent, recorder = watched(LAKE, n_timesteps=2000, engine=engine, learning_rate=0.3)
     assert agent.engine_in_use.startswith(engine)
     table = recorder.initial["q_tables"].copy()[0]
-    changes = {row["step"]: row for row in recorder.changes.rows}
-    assert len(changes) == len(recorder.changes)  # one entry at a time
-    for move in recorder.moves.rows:
+    changes = {row["step"]: row for row in recorder.rows()["changes"]}
+    assert len(changes) == recorder.n_changes  # one entry at a time
+    for move in recorder.rows()["moves"]:
         follows = 0.0 if move["end"] == TERMINATED else 0.99 * table[move["next_obs"]].max()
         assert move["target"] == move["reward"] + follows
         at = move["obs"], move["action"]
@@ -102,56 +99,14 @@ def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
     assert len(outcome.watch.steps if algo == "qlearning" else outcome.watch.moments) > 4
 
 
-@pytest.mark.parametrize(
-    ("algo", "settings", "steps"),
-    [
-        ("ppo", {**SMALL_PPO, "engine": "compiled"}, range(0, 321, 32)),
-        ("dqn", {**SMALL_DQN, "engine": "compiled"}, [0, *range(56, 305, 8)]),
-    ],
-)
-def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, steps):
-    run, outcome = run_of(watched_spec(algo, settings), tmp_path)
-    watch = outcome.watch
-    watch.finish()
-    rows = watch.moments.rows
-    assert (rows["timesteps"].tolist(), watch.n_units) == ([*steps], len(steps) - 1)
-    assert rows["number"].tolist() == [*range(len(steps))]
-    assert rows["loss"][-1] == watch.model.logger.name_to_value["train/loss"]
-    assert np.isnan(rows[0]["loss"])
-    assert np.isnan(rows["value_loss"][1:]).any() == (algo == "dqn")
+def test_of_a_network_there_is_a_map_at_each_evaluation(tmp_path):
+    _, outcome = run_of(watched_spec("ppo", SMALL_PPO, eval_freq=50), tmp_path)
+    numbers, timesteps, values, _ = zip(*outcome.watch.moments, strict=True)
+    assert timesteps == (50, 100, 150, 200, 250, 300, 320)
+    assert numbers == (1, 2, 3, 4, 5, 6, 6)
     # What the start is worth at the end is the return that was computed of the final agent.
-    at_start = rows["values"] @ watch.evaluator.model.initial
-    assert at_start[-1] == pytest.approx(outcome.final.mean_return, abs=1e-12)
-    assert rows["exploration"][0] == (1.0 if algo == "dqn" else pytest.approx(np.nan, nan_ok=True))
-    lengths = [float(row[0]) for row in episodes_of(run.path)]
-    assert rows["training_return"][-1] == pytest.approx(np.mean(lengths[-100:]))
-
-
-def test_what_is_played_covers_the_rise_of_the_greedy_policys_return():
-    """Replayed from the records: it is low where the window begins, and high where it ends."""
-    settings = override(read_entry("qlearning", LAKE), {"n_timesteps": 60_000})
-    spec = read_spec("qlearning", LAKE, settings)
-    exact = exact_evaluator(spec)
-    agent, recorder = make_agent(spec, None), TableRecorder(0, exact)
-    agent.learn(60_000, recorder)
-    begin, end = recorder.window()
-    table = recorder.initial["q_tables"].copy()
-    returns, changes = {}, recorder.changes.rows
-    for step in sorted({*range(0, len(recorder.steps) + 1, 200), begin, end}):
-        now = changes[changes["step"] < step]
-        table.reshape(-1)[now["entry"]] = now["after"]
-        agent.policy.q_tables.copy_(th.from_numpy(table))
-        returns[step] = exact(agent).mean_return
-    low, high = returns[0], max(returns.values())
-    assert high >= 0.9 * exact.yardstick.optimum
-    assert returns[begin] <= low + 0.35 * (high - low)
-    assert max(value for step, value in returns.items() if begin <= step <= end) >= (
-        low + 0.9 * (high - low)
-    )
-    assert 5000 <= end - begin <= 20_000
-    # It begins with an episode.
-    before = recorder.moves.rows[recorder.moves.rows["step"] == begin - 1]
-    assert begin == 0 or before["end"][0] != 0
+    at_start = values[-1] @ outcome.watch.evaluator.model.initial
+    assert at_start == pytest.approx(outcome.final.mean_return, abs=1e-12)
 
 
 def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, monkeypatch):
@@ -336,7 +291,7 @@ def test_two_episodes_worked_by_hand():
     """With step size and discount 1/2: targets 1, 2, then 1 + 1/2 = 1.5, 2."""
     halves = {"learning_rate": 0.5, "gamma": 0.5}
     _, recorder = watched(Corridor(), n_timesteps=9, n_episodes=2, **halves)
-    moves, changes = recorder.moves.rows, recorder.changes.rows
+    moves, changes = recorder.rows()["moves"], recorder.rows()["changes"]
     assert moves["target"].tolist() == [1.0, 2.0, 1.5, 2.0]
     assert moves["td_error"].tolist() == [1.0, 2.0, 1.0, 1.0]
     assert moves["obs"].tolist() == [0, 1, 0, 1]
@@ -348,7 +303,7 @@ def test_two_episodes_worked_by_hand():
     assert changes["entry"].tolist() == [0, 1, 0, 1]
     assert changes["after"].tolist() == [0.5, 1.0, 1.0, 1.5]
     assert changes["step"].tolist() == [0, 1, 2, 3]
-    assert recorder.steps.rows["timesteps"].tolist() == [1, 2, 3, 4]
-    assert recorder.steps.rows["learning_rate"].tolist() == [0.5] * 4
+    assert recorder.rows()["steps"]["timesteps"].tolist() == [1, 2, 3, 4]
+    assert recorder.rows()["steps"]["learning_rate"].tolist() == [0.5] * 4
     # The two episodes are over: nothing was left out.
     assert (recorder.is_full, recorder.is_cut) == (True, False)

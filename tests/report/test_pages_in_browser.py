@@ -256,7 +256,7 @@ def fact(browser, name):
 
 def test_steps_are_played_by_keyboard_and_hostile_names_are_text(browser, played):
     watch, _ = played("rows")
-    moment, rows = browser.find("#moment"), watch.moves.rows
+    moment, rows = browser.find("#moment"), watch.rows()["moves"]
     assert moment.text == "step 0 of 300"
     browser.press(Keys.ARROW_RIGHT)
     assert float(fact(browser, "target")) == pytest.approx(rows["target"][0], rel=1e-5)

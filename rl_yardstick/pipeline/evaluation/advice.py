@@ -22,7 +22,7 @@ from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
-from rl_yardstick.pipeline.evaluation.yardstick import FAILED, NEARLY_ALL
+from rl_yardstick.pipeline.evaluation.yardstick import FAILED
 from rl_yardstick.pipeline.settings import shipped_hyperparams
 from rl_yardstick.pipeline.spec import TrainSpec
 
@@ -38,7 +38,7 @@ MATTERS = 0.05
 # Planning with this many states x actions x outcomes takes about a second.
 MOST_OUTCOMES = 500_000
 # An episode is stuck in a few states if it spends nearly all of its last steps there.
-LAST_STEPS = 100
+LAST_STEPS, NEARLY_ALL = 100, 0.99
 MOST_STATES_NAMED = 3
 
 
@@ -56,21 +56,19 @@ def advice(
     """Advice on a failed agent; None for others, or if the evaluation is not exact."""
     if not isinstance(evaluator, ExactEvaluator) or isinstance(agent, RandomAgent):
         return None
-    policy = evaluator.policy(agent, deterministic=True)
+    policy, yardstick = evaluator.policy(agent, deterministic=True), evaluator.yardstick
     if policy.ndim == 2 and np.issubdtype(policy.dtype, np.integer):
         if len(policy) > 1:  # a planner's policy that depends on the time step
             return None
         policy = policy[0]
-    yardstick = evaluator.yardstick
     # If a constant action is optimal, the score of a near-optimal return may be 0.
     near = yardstick.gap(final.mean_return) <= NEAR_OPTIMUM * abs(yardstick.optimum)
-    failed = yardstick.score(final.mean_return) < FAILED and not near
-    running = still_running(evaluator, policy, 1)
-    if not failed:
-        if running.sum() < NEARLY_ALL:
-            return None
+    if yardstick.score(final.mean_return) >= FAILED or near:
         best = evaluator.optimum[1].argmax(axis=1)
-        if still_running(evaluator, best, 1).sum() >= NEARLY_ALL:  # no policy ends an episode
+        # It has not failed, unless only the best policies end their episodes.
+        if still_running(evaluator, policy, 1).sum() < NEARLY_ALL:
+            return None
+        if still_running(evaluator, best, 1).sum() >= NEARLY_ALL:
             return None
     instead = how_episodes_end(evaluator, policy)
     # Planning uses the state: its score says nothing about agents that do not observe the state.
@@ -83,29 +81,26 @@ def still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats
     model, horizon = evaluator.model, evaluator.horizon
     visits = state_visitation(model, policy, horizon)
     if n_last < horizon:
-        has_time = (
-            policy.ndim == 2 and len(policy) == horizon and policy.shape != model.prob.shape[:2]
-        )
-        before = policy[: horizon - n_last] if has_time and len(policy) > 1 else policy
+        has_time = policy.ndim == 2 and policy.shape != model.prob.shape[:2]
+        before = policy[: horizon - n_last] if has_time and len(policy) == horizon > 1 else policy
         visits = visits - state_visitation(model, before, horizon - n_last)
     return np.maximum(visits, 0.0)
 
 
 def how_episodes_end(evaluator: ExactEvaluator, policy: Any) -> str:
     """Describe how the episodes of a policy end, or where they get stuck."""
-    share = float(still_running(evaluator, policy, 1).sum())
+    share, horizon = float(still_running(evaluator, policy, 1).sum()), evaluator.horizon
     if share < 0.5:
-        worth = policy_return(evaluator.model, policy, evaluator.horizon, success=evaluator.success)
-        end = f"{1 - share:.0%} of its episodes end before the time limit"
-        rate = worth.success_rate
+        found = policy_return(evaluator.model, policy, horizon, success=evaluator.success)
+        end, rate = f"{1 - share:.0%} of its episodes end before the time limit", found.success_rate
         return end if rate is None else f"{end}, {rate:.1%} of all with success"
-    late = still_running(evaluator, policy, min(LAST_STEPS, max(evaluator.horizon // 2, 1)))
+    late = still_running(evaluator, policy, min(LAST_STEPS, max(horizon // 2, 1)))
     order = np.argsort(-late, kind="stable")
     n_states = int(np.searchsorted(np.cumsum(late[order]), NEARLY_ALL * late.sum())) + 1
-    places = [f"state {state}" for state in order[:MOST_STATES_NAMED]]
-    if (layout := evaluator.layout) is not None:
-        cells = layout.cells[order[:MOST_STATES_NAMED]]
-        places = [layout.place_name(int(cell)) for cell in cells]
+    named, layout = order[:MOST_STATES_NAMED], evaluator.layout
+    places = [f"state {state}" for state in named]
+    if layout is not None:
+        places = [layout.place_name(int(cell)) for cell in layout.cells[named]]
     if n_states == 1:
         where = f"it stays at {places[0]}"
     elif n_states <= MOST_STATES_NAMED:
@@ -120,13 +115,17 @@ def _try_first(
     spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator, n_steps: int
 ) -> str | None:
     gamma = getattr(agent, "gamma", None)
-    trained_on = _trained_on(spec, evaluator)
-    if not isinstance(gamma, float) or trained_on is None:
+    with closing(make_single_env(spec, training=True)) as env:
+        model, observations = transition_model(env), observations_of_states(env)
+    if model is None or observations is None or not isinstance(gamma, float):
         return None
-    model, observations = trained_on
+    if model.prob.size > MOST_OUTCOMES or model.prob.shape != evaluator.model.prob.shape:
+        return None
     is_near = share_of_standing_still(agent, model, observations, gamma) >= NEAR_STANDING_STILL
     nearer = max(1 - 0.5 / evaluator.horizon, gamma)
-    score, reached = (_planned(evaluator, model, discount) for discount in (gamma, nearer))
+    plans = [value_iteration(model, discount).policy for discount in (gamma, nearer)]
+    found = [policy_return(evaluator.model, plan, evaluator.horizon) for plan in plans]
+    score, reached = (evaluator.yardstick.score(each.expected_return) for each in found)
     raises_gamma = nearer > gamma and (is_near or score < reached - MATTERS)
     n_tables = len(getattr(agent.policy, "q_tables", [0]))
     n_pairs = int(model.reachable.sum()) * model.n_actions * n_tables
@@ -138,35 +137,17 @@ def _try_first(
     flags, now = [], []
     if needs_steps:
         enough = max(MANY_STEPS * n_pairs, 4 * n_steps)
-        unit: int = 10 ** max(len(str(enough)) - 2, 0)
-        enough = -(-enough // unit) * unit  # rounded up to two digits
+        unit: int = 10 ** max(len(str(enough)) - 2, 0)  # rounded up to two digits
         shipped = shipped_hyperparams(spec).get("n_timesteps") or 0
-        flags.append(f"-n {max(enough, shipped)}")
+        flags.append(f"-n {max(-(-enough // unit) * unit, shipped)}")
         instead = ", instead of --n-episodes" if spec.n_episodes else ""
         now.append(f"{n_steps / n_pairs:.3g} for each state and action{instead}")
     if raises_gamma:
-        even = (
-            f", where even exact planning scores {score:.2f}" if score < reached - MATTERS else ""
-        )
         flags.append(f"-params gamma:{nearer:.6g}")
-        now.append(f"gamma {gamma:.6g}{even}")
+        now.append(f"gamma {gamma:.6g}")
+        if score < reached - MATTERS:
+            now[-1] += f", where even exact planning scores {score:.2f}"
     return f"{' '.join(flags)} (now {'; '.join(now)})"
-
-
-def _trained_on(spec: TrainSpec, evaluator: ExactEvaluator) -> tuple[TransitionModel, Any] | None:
-    """The model of the training environment and the observations of its states, or None."""
-    with closing(make_single_env(spec, training=True)) as env:
-        model, observations = transition_model(env), observations_of_states(env)
-    if model is None or observations is None or model.prob.size > MOST_OUTCOMES:
-        return None
-    return (model, observations) if model.prob.shape == evaluator.model.prob.shape else None
-
-
-def _planned(evaluator: ExactEvaluator, model: TransitionModel, gamma: float) -> float:
-    """The score of the policy that is optimal under a discount."""
-    plan = value_iteration(model, gamma)
-    found = policy_return(evaluator.model, plan.policy, evaluator.horizon)
-    return evaluator.yardstick.score(found.expected_return)
 
 
 def share_of_standing_still(

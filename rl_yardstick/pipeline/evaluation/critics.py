@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import time
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,14 +17,12 @@ from typing import Any, cast
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from stable_baselines3 import A2C
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from rl_yardstick.agents.common.callbacks import BlockCallback
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
-from rl_yardstick.agents.linear.tiles import tiles_of_all, vectors_of
 from rl_yardstick.agents.planning import PlanningAgent
 from rl_yardstick.envs.known_models import (
     action_masks_of_states,
@@ -35,33 +32,26 @@ from rl_yardstick.envs.known_models import (
 )
 from rl_yardstick.mdp import TransitionModel, state_visitation
 from rl_yardstick.mdp.gaps import PolicyValues, discounted_values, expected_estimates
-from rl_yardstick.mdp.graph import LARGEST_DENSE
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.curve_pictures import MEANINGS
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.evaluation.exact import is_wrapped_as_vector
 from rl_yardstick.pipeline.evaluation.policies import (
     OfLastPolicy,
-    believed_values,
     best_actions,
-    is_network,
     obstacle,
+    own_values,
     policy_matrix,
     takes_masks,
 )
 from rl_yardstick.pipeline.files import write_text
 from rl_yardstick.pipeline.spec import TrainSpec
 
-SECONDS_BETWEEN_WRITES = 1.0
-
 # Agents that always learn the values of their exploring policy.
-EXPLORING = frozenset(
-    {
-        "sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo",
-        "semi_gradient_sarsa",
-    }
-)  # fmt: skip
-
+EXPLORING = (
+    *("sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo"),
+    "semi_gradient_sarsa",
+)
 # Gradients are computed for at most this many minibatches of a rollout.
 MOST_MINIBATCHES = 32
 # In larger models, even one comparison takes too long.
@@ -91,26 +81,19 @@ class KnownWorld:
         return OfLastPolicy(shares)
 
     @cached_property
-    def _last_values(self) -> dict[float, OfLastPolicy[PolicyValues]]:
+    def _values(self) -> dict[float, OfLastPolicy[PolicyValues]]:
         return {}
 
     def values(self, policy: Floats, discount: float) -> PolicyValues:
         """The exact values of a policy (S, A)."""
-        known = self._last_values.setdefault(
-            discount, OfLastPolicy(lambda asked: discounted_values(self.model, asked, discount))
-        )
-        return known(policy)
+        new = OfLastPolicy(lambda asked: discounted_values(self.model, asked, discount))
+        return self._values.setdefault(discount, new)(policy)
 
     @cached_property
     def numbers(self) -> dict[bytes, int]:
         """The index of each state, by the bytes of its observation."""
         rows = np.ascontiguousarray(self.observations.reshape(len(self.observations), -1))
         return {row.tobytes(): number for number, row in enumerate(rows)}
-
-    @property
-    def tells_states_apart(self) -> bool:
-        """Whether every state has a different observation."""
-        return len(self.numbers) == self.model.n_states
 
     def states_of(self, observations: NDArray[Any], n_rows: int) -> Ints:
         """The indices of the states with these ``n_rows`` observations, shape (n_rows,)."""
@@ -152,17 +135,6 @@ def known_world(spec: TrainSpec, agent: BaseAlgorithm) -> KnownWorld | str:
     return world
 
 
-def own_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
-    """An agent's values of actions (S, A) or states (S,); None if it has none."""
-    if not isinstance(agent, SoftmaxAlgorithm):
-        return believed_values(agent, observations)
-    policy = agent.policy
-    if not len(policy.state_weights):
-        return None
-    active = tiles_of_all(policy.tiles, vectors_of(policy.observation_space, observations))
-    return np.asarray(policy.state_weights.numpy()[active].sum(axis=1))
-
-
 def recorder_of(
     path: Path, spec: TrainSpec, agent: BaseAlgorithm, *, is_evaluated: bool
 ) -> CriticRecorder | str:
@@ -174,10 +146,10 @@ def recorder_of(
         return world
     explores = learns_exploring_values(spec, agent) or isinstance(agent, SoftmaxAlgorithm)
     if not isinstance(agent, OnPolicyAlgorithm):
-        return CriticRecorder(path, world, spec, explores=explores)
+        return CriticRecorder(path, world, explores=explores)
     has_rollouts = type(agent.rollout_buffer) is RolloutBuffer or takes_masks(agent)
-    is_seen = has_rollouts and world.tells_states_apart
-    return (RolloutRecorder if is_seen else CriticRecorder)(path, world, spec, explores=True)
+    has_rollouts &= len(world.numbers) == world.model.n_states  # observations tell states apart
+    return (RolloutRecorder if has_rollouts else CriticRecorder)(path, world, explores=True)
 
 
 def learns_exploring_values(spec: TrainSpec, agent: BaseAlgorithm) -> bool:
@@ -188,57 +160,25 @@ def learns_exploring_values(spec: TrainSpec, agent: BaseAlgorithm) -> bool:
 class CriticRecorder(BlockCallback):
     """Writes ``diagnosis.csv``: a row for each comparison of the agent.
 
-    Args:
-        path: the file.
-        world: the environment that the agent trains on.
-        spec: the spec of the training.
-        explores: whether the agent learns the values of its exploring policy, else those of its
-            greedy policy.
+    With ``explores``, the agent learns the values of its exploring policy, not of its greedy one.
     """
 
-    def __init__(self, path: Path, world: KnownWorld, spec: TrainSpec, *, explores: bool) -> None:
+    def __init__(self, path: Path, world: KnownWorld, *, explores: bool) -> None:
         super().__init__()
         self.path, self.world, self.explores = path, world, explores
-        # With an explicit evaluation interval, the agent is compared at each evaluation.
-        self.is_limited = spec.eval_freq is None
-        self.training_steps = spec.n_timesteps
-        self.training_episodes = spec.n_episodes
         self.rows: list[dict[str, float]] = []
-        self._written_at = -np.inf
 
     def _on_step(self) -> bool:
         return True
 
-    def judge(self, timesteps: int, n_episodes: int) -> None:
-        """Compare the agent now, unless comparisons would take too large a share of training."""
-        if self.can_afford(n_episodes):
-            self._append(timesteps, self.figures())
-
-    def can_afford(self, n_episodes: int) -> bool:
-        """Whether the training has done enough steps for another comparison."""
-        if not self.is_limited:
-            return True
-        n_trained = self.model.num_timesteps - self.model._num_timesteps_at_start
-        if self.training_episodes is not None:
-            progress = n_episodes / self.training_episodes
-        else:
-            progress = n_trained / (self.training_steps or 1)
-        planned = n_trained / progress if progress > 0 else 0.0
-        least = SECONDS_OF_NETWORKS if is_network(self.model) else SECONDS_IN_ANY_CASE
-        allowed = max(SHARE * planned * seconds_per_step(self.model), least)
-        cost = seconds_of_comparison(self.world, self.model, explores=self.explores)
-        return (len(self.rows) + 1) * cost <= allowed * min(progress, 1.0)
+    def judge(self, timesteps: int) -> None:
+        """Compare the agent at an evaluation."""
+        self._append(timesteps, self.figures())
 
     def finish(self, timesteps: int) -> None:
         """Compare the agent at the end of training, and write the file."""
         if not self.rows or self.rows[-1]["timesteps"] < timesteps:
             self._append(timesteps, self.figures())
-        self.write()
-
-    def write(self) -> None:
-        """Write the rows up to now."""
-        if not self.rows:
-            return
         known = {name for row in self.rows for name in row}
         names = ["timesteps", *(name for name in MEANINGS if name in known)]
         text = io.StringIO()
@@ -246,17 +186,12 @@ class CriticRecorder(BlockCallback):
         table.writeheader()
         table.writerows(self.rows)
         write_text(self.path, text.getvalue())
-        self._written_at = time.monotonic()
 
     def _append(self, timesteps: int, figures: dict[str, float]) -> None:
         finite = {name: value for name, value in figures.items() if np.isfinite(value)}
         self.rows.append({"timesteps": timesteps, **finite})
         for name, value in finite.items():
             self.model.logger.record(f"diagnosis/{name}", value)
-        if time.monotonic() - self._written_at > SECONDS_BETWEEN_WRITES:
-            self.write()
-
-    # --- what is compared -------------------------------------------------------------------------
 
     def policy(self) -> Floats:
         """The target policy of the agent's values, as probabilities of shape (S, A)."""
@@ -321,16 +256,10 @@ class RolloutRecorder(CriticRecorder):
     Until then, the policy is the same as during the whole rollout and the evaluation within it.
     """
 
-    def __init__(self, path: Path, world: KnownWorld, spec: TrainSpec, *, explores: bool) -> None:
-        super().__init__(path, world, spec, explores=explores)
-        self.asked_at: int | None = None  # the time step of the evaluation
+    asked_at: int | None = None  # the time step of the evaluation
 
-    def wants_rollout_end(self) -> bool:
-        return self.asked_at is not None
-
-    def judge(self, timesteps: int, n_episodes: int) -> None:
-        if self.can_afford(n_episodes):
-            self.asked_at = timesteps
+    def judge(self, timesteps: int) -> None:
+        self.asked_at = timesteps
 
     def _on_rollout_end(self) -> None:
         if self.asked_at is None:
@@ -356,18 +285,11 @@ class RolloutRecorder(CriticRecorder):
         if world.is_limited:
             n_left = np.minimum(n_left, world.horizon - (times - begun))
         assert critic is not None
-        steps = states, actions, n_left.reshape(-1)
-        expected, shared = expected_estimates(
-            world.model, policy, critic, agent.gamma, agent.gae_lambda, steps
-        )
-        ones = np.ones(len(states))
-        found = {
-            "gae_bias": root_mean_square(
-                expected - shared - exact.advantages[states, actions], ones
-            ),
-            "gae_offset": root_mean_square(shared, ones),
-            "gae_std": root_mean_square(estimates - expected, ones),
-        }
+        discounts, steps = (agent.gamma, agent.gae_lambda), (states, actions, n_left.reshape(-1))
+        expected, shared = expected_estimates(world.model, policy, critic, *discounts, steps)
+        biases, ones = expected - shared - exact.advantages[states, actions], np.ones(len(states))
+        errors = {"gae_bias": biases, "gae_offset": shared, "gae_std": estimates - expected}
+        found = {name: root_mean_square(values, ones) for name, values in errors.items()}
         visits = world.visits(policy)[:, None]
         true = np.where((visits > 0) & (policy > 0), visits * policy * exact.advantages, 0.0)
         if np.isfinite(true).all():
@@ -428,47 +350,7 @@ def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> 
     parameters = [p for p in policy.parameters() if p.requires_grad]
     found = []
     for weight in th.as_tensor(weights, dtype=logs.dtype, device=logs.device):
-        slopes: Any = th.autograd.grad(
-            logs, parameters, weight, retain_graph=True, allow_unused=True
-        )
+        kept: Any = {"retain_graph": True, "allow_unused": True}
+        slopes: Any = th.autograd.grad(logs, parameters, weight, **kept)
         found.append(th.cat([slope.reshape(-1) for slope in slopes if slope is not None]))
     return np.asarray(th.stack(found).double().cpu().numpy())
-
-
-# --- how often to compare -------------------------------------------------------------------------
-
-# The share of training time for comparisons, by the estimates below: high ones for comparisons, low
-# ones for training steps. No clock is used, so the same seed gives the same file.
-SHARE = 0.1
-SECONDS_IN_ANY_CASE = 5e-3
-SECONDS_OF_NETWORKS = 2e-2  # the same for networks
-
-
-def seconds_per_step(model: BaseAlgorithm) -> float:
-    """A lower estimate of the time of a training step."""
-    engine, learns_weights = getattr(model, "engine_in_use", "") or "", is_network(model)
-    if engine.startswith("compiled but"):
-        return 2e-5
-    if engine.startswith("compiled"):
-        return 2.5e-6 if isinstance(model, A2C) else 1e-5 if learns_weights else 7e-8
-    return 7e-5 if learns_weights else 4e-5
-
-
-def seconds_of_comparison(world: KnownWorld, model: BaseAlgorithm, *, explores: bool) -> float:
-    """An upper estimate of the time of a comparison."""
-    per_state = world.model.n_actions * world.model.n_outcomes
-    n_states = int(world.model.reachable.sum())
-    visits = 7e-9 * world.horizon * n_states * per_state
-    seconds = (7e-4 + visits) if explores else (4e-4 + visits / 3)
-    seconds += 2e-7 * world.model.prob.size
-    if n_states <= LARGEST_DENSE:
-        seconds += 1e-10 * n_states**3
-    else:
-        seconds += (3e-5 if explores else 3e-6) * n_states
-    if model.gamma == 1:  # type: ignore[attr-defined]
-        seconds *= 2  # first it finds the states from which every episode ends
-    if is_network(model):
-        seconds += 1e-3 + 5e-6 * world.model.n_states
-    if isinstance(model, OnPolicyAlgorithm):
-        seconds += 7e-3 + 6e-6 * model.n_steps * model.n_envs
-    return seconds

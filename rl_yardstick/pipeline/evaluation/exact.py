@@ -2,12 +2,15 @@
 
 If the transition model of the environment is known, the evaluator queries the policy in all states
 at once, and computes its expected return under the time limit, without evaluation noise.
+
+Where observations hide the state, there are three optima: of policies of the state, of policies of
+all observations so far, and of memoryless policies, which use only the current observation. An
+agent's score uses that of its kind.
 """
 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -16,7 +19,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -37,13 +39,13 @@ from rl_yardstick.mdp import (
     finite_horizon_optimum,
     optimal_choices,
     optimum_far_from_limit,
-    policy_iteration,
     policy_return,
     state_values,
 )
+from rl_yardstick.mdp.beliefs import Bracket, memory_optimum
+from rl_yardstick.mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats
 from rl_yardstick.pipeline.environments import evaluation_kwargs, make_single_env
-from rl_yardstick.pipeline.evaluation.observability import HiddenScale, hidden_scale
 from rl_yardstick.pipeline.evaluation.policies import (
     OfLastPolicy,
     acts_by,
@@ -52,7 +54,7 @@ from rl_yardstick.pipeline.evaluation.policies import (
     policy_matrix,
 )
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
-from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # Limit for the array with the observations of all states.
@@ -64,14 +66,67 @@ MOST_BACKUPS = 20_000_000_000
 # The most steps x outcomes of all states and actions for which `OtherReturns` are computed: in a
 # millisecond on a small model, and in about two seconds at most.
 MOST_OUTCOMES_OF_OTHERS = 600_000_000
-# For `discount_note`: the most outcomes of all states and actions (planning takes a tenth of a
-# second), and the score below which there is a note.
-MOST_OUTCOMES_PLANNED = 250_000
-LOW_SCORE = 0.95
-# The most cached evaluators of plain runs, and the most states of their models. By caching, runs in
-# one process compute the optimum once; larger models would need too much memory.
+# The most cached evaluators, and the most states of their models.
 MOST_KEPT = 8
 MOST_STATES_KEPT = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenScale:
+    """The optima of an environment whose observations hide the state."""
+
+    full_optimum: float
+    baseline: float
+    memory: Bracket  # of policies of all observations so far
+    now: Bracket  # of memoryless policies
+    best: BestMemoryless | None  # the best memoryless policy found; None if none was searched
+
+    def yardstick(self, with_memory: bool) -> Yardstick:
+        """The yardstick for agents with memory, or for memoryless agents."""
+        lower, upper = self.memory if with_memory else self.now
+        hidden = HiddenState(self.full_optimum, (self.memory.lower, self.memory.upper), with_memory)
+        return Yardstick(upper, self.baseline, None if lower == upper else lower, hidden=hidden)
+
+    @property
+    def note(self) -> str | None:
+        """A line on the best memoryless policy, if it is stochastic."""
+        best = self.best
+        if best is None or not best.needs_chance:
+            return None
+        found = [
+            "" if known else " found" for known in (best.lower == best.upper, best.is_firm_known)
+        ]
+        return (
+            f"the best memoryless policy{found[0]} is stochastic and returns {best.lower:.2f}; "
+            f"the best deterministic one{found[1]}, as in evaluations, returns {best.firm:.2f}"
+        )
+
+
+def hidden_scale(
+    model: TransitionModel,
+    observations: NDArray[np.generic],
+    horizon: int,
+    full_optimum: float,
+    baseline: float,
+) -> HiddenScale | None:
+    """The optima under partial observability; None if a memoryless policy reaches the optimum.
+
+    ``observations`` has the states along its first axis; ``full_optimum`` is that of policies of
+    the state, ``baseline`` the return of the best random or constant policy.
+    """
+    groups = observation_groups(observations, model.reachable)
+    if groups is None:
+        return None
+    memory = memory_optimum(model, groups, horizon) or Bracket(baseline, full_optimum)
+    most = min(memory.upper, full_optimum)
+    best = best_memoryless(model, groups, horizon, most)
+    if best is not None and best.lower >= full_optimum - PROVED * max(1.0, abs(full_optimum)):
+        return None
+    now = Bracket(baseline, most)
+    if best is not None:
+        now = Bracket(max(best.lower, baseline), max(best.upper, baseline))
+    least = memory.lower if memory.lower == memory.upper else max(memory.lower, now.lower)
+    return HiddenScale(full_optimum, baseline, Bracket(least, most), now, best)
 
 
 @dataclass(frozen=True)
@@ -100,9 +155,9 @@ class ExactEvaluator:
 
         Empty if the model is large.
         """
-        if self.model.prob.size * self.horizon > MOST_OUTCOMES_OF_OTHERS:
-            return OtherReturns()
         found, discount = OtherReturns(), getattr(agent, "gamma", None)
+        if self.model.prob.size * self.horizon > MOST_OUTCOMES_OF_OTHERS:
+            return found
         with suppress(TypeError, ValueError):  # an agent's probabilities may not be known
             policy = self.policy(agent, deterministic=False)
             # The mean alone takes a fifth of the time that `policy_return` takes.
@@ -124,18 +179,14 @@ class ExactEvaluator:
 
     @cached_property
     def _worth(self) -> OfLastPolicy[Evaluation]:
-        return OfLastPolicy(self._evaluate)
+        def worth(policy: NDArray[Any]) -> Evaluation:
+            found = policy_return(self.model, policy, self.horizon, success=self.success)
+            rate, std = found.success_rate, float(np.sqrt(found.return_variance))
+            returns, lengths = np.array([found.expected_return]), np.array([found.expected_length])
+            successes = None if rate is None else np.array([rate])
+            return Evaluation(returns, lengths, successes, std, self.yardstick)
 
-    def _evaluate(self, policy: NDArray[Any]) -> Evaluation:
-        result = policy_return(self.model, policy, self.horizon, success=self.success)
-        rate = result.success_rate
-        return Evaluation(
-            returns=np.array([result.expected_return]),
-            lengths=np.array([result.expected_length]),
-            successes=None if rate is None else np.array([rate]),
-            exact_std=float(np.sqrt(result.return_variance)),
-            yardstick=self.yardstick,
-        )
+        return OfLastPolicy(worth)
 
     @cached_property
     def values(self) -> OfLastPolicy[Floats]:
@@ -161,35 +212,41 @@ class ExactEvaluator:
         return obstacle(agent, self.observations, self.masks, self.horizon, deterministic)
 
 
-def _observation_bytes(space: spaces.Space[Any]) -> int:
-    """Bytes of one observation; 0 if unknown."""
-    if isinstance(space, spaces.Dict):
-        return sum(map(_observation_bytes, space.spaces.values()))
-    if isinstance(space, spaces.Tuple):
-        return sum(map(_observation_bytes, space.spaces))
-    if space.shape is None or space.dtype is None:
-        return 0
-    return math.prod(space.shape) * space.dtype.itemsize
+def is_wrapped_as_vector(spec: TrainSpec) -> bool:
+    """Whether a VecEnv wrapper changes the agent's observations."""
+    return bool(spec.normalize is not None or spec.frame_stack or spec.vec_env_wrapper)
 
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
-    """Make the exact evaluator of a run, or None if episodes have to be sampled."""
+    """The exact evaluator of a run, or None if episodes have to be sampled."""
     return None if is_wrapped_as_vector(spec) else evaluator_of_single(spec)
 
 
+_kept: dict[str, ExactEvaluator] = {}
+
+
 def evaluator_of_single(spec: TrainSpec) -> ExactEvaluator | None:
-    """Like `exact_evaluator`, but ignores VecEnv wrappers."""
+    """Like `exact_evaluator`, but ignores VecEnv wrappers; cached for later runs of the process."""
+    if spec.env_wrapper or spec.gym_packages:  # of which the key tells too little
+        return _evaluator(spec)
+    masks = spec.algorithm.get("mask_actions", False)
+    key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks))
+    found = _kept.pop(key, None) or _evaluator(spec)
+    if found is not None and found.model.n_states <= MOST_STATES_KEPT:
+        _kept[key] = found
+        if len(_kept) > MOST_KEPT:
+            del _kept[next(iter(_kept))]
+    return found
+
+
+def _evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     with closing(make_single_env(spec)) as env:
-        model, horizon = transition_model(env), time_limit(env)
-        if model is None or horizon is None:
-            return None
-        if model.n_states * _observation_bytes(env.observation_space) > MOST_BYTES_OBSERVED:
+        model, horizon, space = transition_model(env), time_limit(env), env.observation_space
+        n_bytes = math.prod(space.shape or ()) * np.dtype(space.dtype).itemsize
+        if model is None or horizon is None or model.n_states * n_bytes > MOST_BYTES_OBSERVED:
             return None
         observations = observations_of_states(env)
-        if observations is None:
-            return None
-        optimum = _optimum(model, horizon)
-        if optimum is None:
+        if observations is None or (optimum := _optimum(model, horizon)) is None:
             return None
         masks = action_masks_of_states(env)
         success, layout = success_outcomes(env), grid_layout(env)
@@ -218,51 +275,3 @@ def model_refusal(spec: TrainSpec) -> str | None:
     with closing(make_single_env(spec)) as env:
         check = model_check(env)
     return None if check is None else check.refusal
-
-
-def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> str | None:
-    """A one-line note on what the agent's discount costs; None if the cost is small.
-
-    The best policy under the discount, planned exactly on the training environment, is evaluated
-    like an agent. A learner cannot be expected to do better.
-    """
-    with closing(make_single_env(spec, training=True)) as env:
-        model = transition_model(env)
-    if model is None or model.prob.shape != exact.model.prob.shape or exact.scale is not None:
-        return None
-    if model.prob.size > MOST_OUTCOMES_PLANNED or not 0 <= discount < 1:
-        return None
-
-    def score(gamma: float) -> float:
-        plan = policy_iteration(model, gamma)
-        worth = policy_return(exact.model, plan.policy, exact.horizon)
-        return exact.yardstick.score(worth.expected_return)
-
-    reached, other = score(discount), 1 - 1 / (2 * exact.horizon)
-    if reached >= LOW_SCORE:
-        return None
-    said = f"at gamma {discount:g} even exact planning scores {reached:.2f} here"
-    better = score(other)
-    return f"{said}; {other:g}: {better:.2f} (gamma: auto)" if better > reached + 0.01 else said
-
-
-def is_wrapped_as_vector(spec: TrainSpec) -> bool:
-    """Whether a VecEnv wrapper changes the agent's observations."""
-    return bool(spec.normalize is not None or spec.frame_stack or spec.vec_env_wrapper)
-
-
-_kept: OrderedDict[str, ExactEvaluator] = OrderedDict()
-
-
-def evaluator_of(spec: TrainSpec) -> ExactEvaluator | None:
-    """Like `exact_evaluator`, cached for runs on the same environment without wrappers."""
-    if spec.env_wrapper or spec.gym_packages or is_wrapped_as_vector(spec):
-        return exact_evaluator(spec)
-    masks = spec.algorithm.get("mask_actions", False)
-    key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks))
-    evaluator = _kept.pop(key, None) or exact_evaluator(spec)
-    if evaluator is not None and evaluator.model.n_states <= MOST_STATES_KEPT:
-        _kept[key] = evaluator
-        if len(_kept) > MOST_KEPT:
-            _kept.popitem(last=False)
-    return evaluator

@@ -23,14 +23,18 @@ from rl_yardstick.agents.common.exploration import BOLTZMANN
 from rl_yardstick.agents.common.masks import check_masks_exist, present_masks
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
+from rl_yardstick.agents.linear.tiles import tiles_of_all, vectors_of
 from rl_yardstick.agents.planning import PlanningAgent
 from rl_yardstick.agents.reference import RandomAgent
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.finite_numbers import check_rows
 
-# Agents of these packages accept any number of observations at once.
-KNOWN_LIBRARIES = ("rl_yardstick", "stable_baselines3")
+
+def is_of_library(module: str) -> bool:
+    """Whether a module's agents accept any number of observations at once, and hide no memory."""
+    return module.partition(".")[0] in ("rl_yardstick", "stable_baselines3", "sb3_contrib")
 
 
 def is_network(model: BaseAlgorithm) -> bool:
@@ -59,30 +63,29 @@ def _parameters(predict: Callable[..., Any]) -> frozenset[str]:
     return frozenset(inspect.signature(predict).parameters)
 
 
-def player(model: BaseAlgorithm, env: VecEnv) -> Any:
-    """The agent, wrapped to receive masks from ``env`` if it takes action masks."""
-    if not takes_masks(model):
-        return model
-    try:
-        check_masks_exist(env)
-    except ValueError as error:
-        raise UserError(
-            f"{type(model).__name__} needs action masks, and the environment has none"
-        ) from error
-    return MaskTold(model, env)
+class Player:
+    """An agent in environments: it is told action masks, and sees finite observations only.
 
+    Raises:
+        UserError: if it takes masks, and the environments have none.
+    """
 
-class MaskTold:
-    """Passes the action masks of environments to an agent."""
-
-    def __init__(self, model: Any, env: VecEnv) -> None:
-        self.model = model
-        self.env = env
+    def __init__(self, model: BaseAlgorithm, env: VecEnv, when: str) -> None:
+        self.model, self.env, self.when = model, env, when
+        self.is_masked = takes_masks(model)
+        try:
+            if self.is_masked:
+                check_masks_exist(env)
+        except ValueError as error:
+            needs = f"{type(model).__name__} needs action masks, and the environment has none"
+            raise UserError(needs) from error
 
     def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """Predict with the current action masks of the environments."""
-        masks = present_masks(self.env, observation)
-        actions, state = self.model.predict(observation, action_masks=masks, **kwargs)
+        """Check the observation, then predict."""
+        check_rows(observation, "observation", self.when)
+        if self.is_masked:
+            kwargs["action_masks"] = present_masks(self.env, observation)
+        actions, state = self.model.predict(observation, **kwargs)
         return actions, state
 
 
@@ -141,7 +144,7 @@ def obstacle(
 
 def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
     """Why `predict` fails for all states at once, or empty; tries it for the user's agents."""
-    if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
+    if is_of_library(type(agent).__module__):
         return ""
     try:
         asked = [agent.predict(observations, deterministic=True) for _ in range(2)]
@@ -178,14 +181,12 @@ def policy_matrix(
         return agent.action_probabilities(observations)
     policy: Any = getattr(agent, "policy", None)
     if hasattr(policy, "get_distribution"):  # an actor with a softmax over actions
-
-        def probabilities(part: NDArray[Any], **told: Any) -> NDArray[Any]:
-            with th.no_grad():
-                tensor, _ = policy.obs_to_tensor(part)
-                probs = policy.get_distribution(tensor, **told).distribution.probs
-            return np.asarray(probs.cpu().numpy(), dtype=np.float64)
-
-        return _in_parts(agent, observations, masks, probabilities)
+        return _of_network(
+            agent,
+            observations,
+            lambda seen, **told: policy.get_distribution(seen, **told).distribution.probs,
+            masks,
+        )
     # DQN, and QR-DQN, which may not be installed and is not a subclass of DQN.
     homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
     if any(base.__module__.startswith(homes) for base in type(agent).__mro__):
@@ -206,9 +207,8 @@ def acts_by(agent: BaseAlgorithm) -> str:
     if draws or hasattr(agent.policy, "get_distribution"):
         return "its own distribution"
     is_softmax = getattr(agent, "strategy", None) == BOLTZMANN
-    return (
-        f"{'temperature' if is_softmax else 'epsilon'} {getattr(agent, 'exploration_rate', 0.0):g}"
-    )
+    rate = getattr(agent, "exploration_rate", 0.0)
+    return f"{'temperature' if is_softmax else 'epsilon'} {rate:g}"
 
 
 def best_actions(
@@ -217,7 +217,6 @@ def best_actions(
     """The agent's greedy action in each state, shape (S,)."""
     if reason := _cannot_be_asked(agent, masks):
         raise TypeError(f"{type(agent).__name__}: {reason}")
-
     # Reading a plain table is faster than `predict`, which would take most of an evaluation.
     is_ours = type(agent).predict is TabularAlgorithm.predict and not takes_masks(agent)
     table: object = agent.policy if is_ours else None
@@ -230,6 +229,23 @@ def best_actions(
     return _in_parts(agent, observations, masks, predicted).astype(np.int64)
 
 
+def _of_network(
+    agent: BaseAlgorithm,
+    observations: NDArray[Any],
+    asked: Callable[..., th.Tensor],
+    masks: Bools | None = None,
+) -> Floats:
+    """The results of a function of tensors of observations, float64."""
+    policy: Any = agent.policy
+
+    def numbers(part: NDArray[Any], **told: Any) -> NDArray[Any]:
+        with th.no_grad():
+            found = asked(policy.obs_to_tensor(part)[0], **told)
+        return np.asarray(found.cpu().numpy(), dtype=np.float64)
+
+    return _in_parts(agent, observations, masks, numbers)
+
+
 def _in_parts(
     agent: BaseAlgorithm,
     observations: NDArray[Any],
@@ -240,11 +256,11 @@ def _in_parts(
     n_states = len(observations)
     n_rows = max(MOST_AT_ONCE // _n_inputs(agent), 1) if is_network(agent) else n_states
     told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
-    found = [
-        asked(observations[i : i + n_rows], **{k: v[i : i + n_rows] for k, v in told.items()})
-        for i in range(0, n_states, n_rows)
-    ]
-    return found[0] if len(found) == 1 else np.concatenate(found)
+    if n_states <= n_rows:
+        return asked(observations, **told)
+    parts = [slice(i, i + n_rows) for i in range(0, n_states, n_rows)]
+    found = [asked(observations[p], **{name: m[p] for name, m in told.items()}) for p in parts]
+    return np.concatenate(found)
 
 
 def _n_inputs(agent: BaseAlgorithm) -> int:
@@ -260,7 +276,7 @@ def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:
     return ""
 
 
-# --- values or probabilities of actions at one observation ----------------------------------------
+# --- values or probabilities of actions -----------------------------------------------------------
 
 
 class ActionFigures(NamedTuple):
@@ -282,25 +298,18 @@ def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | N
             return ActionFigures(word, np.asarray(table)[row if len(table) > 1 else 0])
     if isinstance(agent, SoftmaxAlgorithm):
         return ActionFigures("probability", agent.action_probabilities(observations)[0])
-    if isinstance(agent, TileAlgorithm):
-        return ActionFigures("value", agent.policy.sums(observations)[0])
-    with th.no_grad():
-        if (net := getattr(policy, "q_net", None)) is not None:
-            values = net(policy.obs_to_tensor(observations)[0])[0]
-            return ActionFigures("value", values.cpu().numpy())
-        if (net := getattr(policy, "quantile_net", None)) is not None:
-            values = net(policy.obs_to_tensor(observations)[0])[0].mean(dim=0)
-            return ActionFigures("value", values.cpu().numpy())
-        # A recurrent policy would need its hidden state.
-        if isinstance(policy, ActorCriticPolicy) and not hasattr(policy, "lstm_actor"):
+    # A recurrent policy would need its hidden state.
+    if isinstance(policy, ActorCriticPolicy) and not hasattr(policy, "lstm_actor"):
+        with th.no_grad():
             distribution = policy.get_distribution(policy.obs_to_tensor(observations)[0])
-            if isinstance(distribution, CategoricalDistribution):
-                values = distribution.distribution.probs[0]
-                return ActionFigures("probability", values.cpu().numpy())
-    return None
+        if not isinstance(distribution, CategoricalDistribution):
+            return None
+        return ActionFigures("probability", distribution.distribution.probs[0].cpu().numpy())
+    values = own_values(agent, observations)
+    return None if values is None or values.ndim == 1 else ActionFigures("value", values[0])
 
 
-def believed_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
+def own_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
     """The agent's own values of actions (S, A) or states (S,); None if it has none.
 
     ``observations`` has the states along its first axis.
@@ -308,21 +317,19 @@ def believed_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats 
     policy: Any = agent.policy
     if isinstance(agent, TabularAlgorithm):
         return np.asarray(policy.q_table[observations])
-    if isinstance(agent, TileAlgorithm) and not isinstance(agent, SoftmaxAlgorithm):
+    if isinstance(agent, SoftmaxAlgorithm):
+        if not len(policy.state_weights):
+            return None
+        active = tiles_of_all(policy.tiles, vectors_of(policy.observation_space, observations))
+        return np.asarray(policy.state_weights.numpy()[active].sum(axis=1))
+    if isinstance(agent, TileAlgorithm):
         return np.asarray(policy.sums(observations))
     if not is_network(agent) or has_memory(agent):
         return None
-
-    def asked(part: NDArray[Any]) -> NDArray[Any]:
-        with th.no_grad():
-            tensor, _ = policy.obs_to_tensor(part)
-            if (net := getattr(policy, "q_net", None)) is not None:
-                values = net(tensor)
-            elif (net := getattr(policy, "quantile_net", None)) is not None:
-                values = net(tensor).mean(dim=1)
-            else:
-                values = policy.predict_values(tensor)[:, 0]
-        return np.asarray(values.cpu().numpy(), dtype=np.float64)
-
-    has_values = any(hasattr(policy, name) for name in ("q_net", "quantile_net", "predict_values"))
-    return _in_parts(agent, observations, None, asked) if has_values else None
+    if hasattr(policy, "q_net"):
+        return _of_network(agent, observations, policy.q_net)
+    if hasattr(policy, "quantile_net"):
+        return _of_network(agent, observations, lambda seen: policy.quantile_net(seen).mean(dim=1))
+    if hasattr(policy, "predict_values"):
+        return _of_network(agent, observations, lambda seen: policy.predict_values(seen)[:, 0])
+    return None

@@ -23,15 +23,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from rl_yardstick.envs.brackets import may_have_bracket, optimum_bracket
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.pipeline.evaluation.policies import KNOWN_LIBRARIES, is_network, player
+from rl_yardstick.pipeline.evaluation.policies import Player, is_network
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
-from rl_yardstick.pipeline.finite_numbers import FinitePlayer, check_numbers
+from rl_yardstick.pipeline.finite_numbers import check_numbers
 from rl_yardstick.pipeline.spec import TrainSpec
-
-# A mean this many standard errors above an upper bound shows that the bound is wrong.
-BEYOND_CHANCE = 6.0
-# Fewer episodes may all have begun in states of high return.
-FEWEST_TO_TELL = 10
 
 
 @dataclass(frozen=True)
@@ -86,24 +81,6 @@ class Evaluation:
         """Share of successful episodes, if the environment reports success."""
         return None if self.successes is None else float(self.successes.mean())
 
-    @property
-    def beats_optimum(self) -> bool:
-        """Whether the mean is significantly above the upper bound of the optimum.
-
-        If so, the bracket is wrong, or belongs to another environment.
-        """
-        if self.yardstick is None or self.yardstick.at_least is None:
-            return False
-        if len(self.returns) < FEWEST_TO_TELL:
-            return False
-        error = self.std_return / math.sqrt(len(self.returns) - 1)
-        # Monitor rounds returns to six digits.
-        return self.mean_return - BEYOND_CHANCE * error > self.yardstick.optimum + 1e-6
-
-    def measured_by(self, yardstick: Yardstick | None) -> Evaluation:
-        """The same figures with another yardstick."""
-        return replace(self, yardstick=yardstick)
-
     def joined(self, more: Evaluation) -> Evaluation:
         """These sampled episodes together with further ones of the same agent."""
         both = None
@@ -126,8 +103,6 @@ class Evaluation:
             figures |= self.yardstick.figures(self.mean_return)
         if self.others is not None:
             figures |= asdict(self.others)
-        if self.beats_optimum:
-            figures["beats_optimum"] = True
         return figures
 
 
@@ -145,12 +120,9 @@ def evaluate(
     when = f"in the evaluation at step {getattr(model, 'num_timesteps', 0):,}"
     if seed is not None:
         env.seed(seed)
-    watched: Any = FinitePlayer(player(model, env), when)
+    watched: Any = Player(model, env, when)
     returns, lengths = evaluate_policy(
-        watched,
-        env,
-        n_eval_episodes=n_episodes,
-        deterministic=deterministic,
+        *(watched, env, n_episodes, deterministic),
         return_episode_rewards=True,
         callback=note_success,
         warn=False,
@@ -161,22 +133,6 @@ def evaluate(
         np.asarray(lengths, dtype=np.int64),
         np.array(successes) if len(successes) == n_episodes else None,
     )
-
-
-def takes_batches(model: BaseAlgorithm) -> bool:
-    """Whether an agent can act in several environments at once."""
-    if type(model).__module__.partition(".")[0] in KNOWN_LIBRARIES:
-        return True
-    sample: Any = model.observation_space.sample()
-    try:
-        if isinstance(sample, dict):
-            twice: Any = {name: np.stack([part, part]) for name, part in sample.items()}
-        else:
-            twice = np.stack([sample, sample])
-        actions, _ = model.predict(twice, deterministic=True)
-    except Exception:  # noqa: BLE001  # a stranger's code can fail in any way
-        return False
-    return len(np.atleast_1d(actions)) == 2
 
 
 def evaluation_seed(seed: int, purpose: int) -> int:
@@ -203,20 +159,17 @@ class Shares(NamedTuple):
     at_first: float  # for short trainings, up to `STEPS_AT_FIRST` evaluation steps
 
 
-# Chosen by the time of an evaluation step relative to a training step, so that evaluations take at
-# most a fifth of the training time. Figures: docs/benchmarks.md.
-NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
-TABLE = Shares(usual=1 / 100, at_first=1 / 5)
+# For networks and for tables, by what is compiled. Chosen by the time of an evaluation step
+# relative to a training step, so that evaluations take at most a fifth of the training time.
+# Figures: docs/benchmarks.md.
+SHARES = {
+    "nothing": (Shares(1 / 4, 1 / 2), Shares(1 / 100, 1 / 5)),
+    "training and evaluation": (Shares(1 / 4, 1 / 2), Shares(1 / 10, 1 / 2)),
+    "training": (Shares(1 / 32, 1 / 32), Shares(1 / 2500, 1 / 2500)),
+    "learning": (Shares(1 / 32, 1 / 6), Shares(1 / 32, 1 / 6)),  # the environments are in Python
+}
 # A2C learns once from each step, which takes no longer than playing it.
-LIGHT_NETWORK = Shares(usual=1 / 10, at_first=1 / 10)
-# Training and evaluation are both compiled.
-COMPILED_NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
-COMPILED_TABLE = Shares(usual=1 / 10, at_first=1 / 2)
-# Learning is compiled, the environments are in Python.
-PYTHON_ENV = Shares(usual=1 / 32, at_first=1 / 6)
-# Training is compiled, evaluation cannot be.
-NETWORK_ALONE = Shares(usual=1 / 32, at_first=1 / 32)
-TABLE_ALONE = Shares(usual=1 / 2500, at_first=1 / 2500)
+LIGHT_NETWORK = Shares(1 / 10, 1 / 10)
 STEPS_AT_FIRST = 10_000
 # A tenth of a second in most environments.
 STEPS_IN_ANY_CASE = 2_000
@@ -224,15 +177,15 @@ STEPS_IN_ANY_CASE = 2_000
 
 def shares_of(model: BaseAlgorithm, *, plays_compiled: bool) -> Shares:
     """The evaluation steps per training step of an agent."""
-    engine, learns_weights = getattr(model, "engine_in_use", "") or "", is_network(model)
+    engine, compiled = getattr(model, "engine_in_use", "") or "", "nothing"
     if engine.startswith("compiled but"):
-        return PYTHON_ENV
-    if not engine.startswith("compiled"):
-        light = LIGHT_NETWORK if isinstance(model, A2C) else NETWORK
-        return light if learns_weights else TABLE
-    if plays_compiled:
-        return COMPILED_NETWORK if learns_weights else COMPILED_TABLE
-    return NETWORK_ALONE if learns_weights else TABLE_ALONE
+        compiled = "learning"
+    elif engine.startswith("compiled"):
+        compiled = "training and evaluation" if plays_compiled else "training"
+    elif isinstance(model, A2C) and is_network(model):
+        return LIGHT_NETWORK
+    of_network, of_table = SHARES[compiled]
+    return of_network if is_network(model) else of_table
 
 
 def allowed_steps(n_trained: float, shares: Shares) -> float:
@@ -253,58 +206,57 @@ PRECISION = 0.05
 PRECISION_AT_THE_END = 0.01
 
 
+# Evaluation environments of CartPole or MountainCar, their compiled counterpart for
+# `agents.compiled.loop`, and what converts its observations.
+CompiledCopy = tuple[DummyVecEnv, Any, Any]
+
+
 class SampledEvaluator:
     """Evaluates by episodes: a given number, or as few as are precise enough."""
 
     def __init__(self, spec: TrainSpec, env: VecEnv, yardstick: Yardstick | None = None) -> None:
-        self.env = env
-        self.yardstick = yardstick or bracketed_yardstick(spec)
-        self.seed = spec.seed
-        self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
-        # Explicit intervals or numbers of episodes take precedence over the limit.
-        self.is_limited = spec.eval_episodes is None and spec.eval_freq is None
-        self.training_steps = spec.n_timesteps
-        self.training_episodes = spec.n_episodes
+        self.env, self.yardstick = env, yardstick or bracketed_yardstick(spec)
+        self.spec = spec
         self.n_steps = 0  # in all evaluations
         self._left = math.inf
         self._last_length: float | None = None
 
     def can_afford(self, model: BaseAlgorithm, n_episodes: int) -> bool:
         """Whether the training has done enough steps for another evaluation."""
-        if self.is_limited:
+        # Explicit intervals or numbers of episodes take precedence over the limit.
+        if self.spec.eval_episodes is None and self.spec.eval_freq is None:
             n_trained = model.num_timesteps - model._num_timesteps_at_start
-            progress = n_trained / (self.training_steps or math.inf)
-            if self.training_episodes is not None:
-                progress = n_episodes / self.training_episodes
+            progress = n_trained / (self.spec.n_timesteps or math.inf)
+            if self.spec.n_episodes is not None:
+                progress = n_episodes / self.spec.n_episodes
             planned = n_trained / progress if progress > 0 else 0.0
             allowed = self._allowed(model, planned) * min(progress, 1.0)
             self._left = allowed * PART_DURING_TRAINING - self.n_steps
-        return STAGES[0] * self._usual_length(model) <= self._left
+        length = self._last_length
+        if length is None:  # then of training's last episodes
+            lengths = [episode["l"] for episode in getattr(model, "ep_info_buffer", None) or ()]
+            length = float(np.mean(lengths[-STAGES[0] :])) if lengths else 1.0
+        return STAGES[0] * length <= self._left
 
     def __call__(self, model: BaseAlgorithm) -> Evaluation:
         """Evaluate during training."""
-        stages = STAGES if self.n_episodes is None else (self.n_episodes,)
-        return self._evaluate(model, stages, PRECISION, self._left, evaluation_seed(self.seed, 1))
+        n_episodes, seed = self.spec.eval_episodes, evaluation_seed(self.spec.seed, 1)
+        stages = STAGES if n_episodes is None else (n_episodes,)
+        return self._evaluate(model, stages, PRECISION, self._left, seed)
 
     def at_the_end(self, model: BaseAlgorithm) -> Evaluation:
         """Evaluate at the end of training, on separate episodes."""
         n_trained = model.num_timesteps - model._num_timesteps_at_start
         allowed = self._allowed(model, n_trained)
         left = max(allowed - self.n_steps, allowed * (1 - PART_DURING_TRAINING))
-        stages = STAGES_AT_THE_END if self.n_final is None else (self.n_final,)
-        length = self._last_length or math.inf
-        if self.n_final is None and stages[0] * length > left:
+        n_episodes, seed = self.spec.final_episodes, evaluation_seed(self.spec.seed, 2)
+        stages = STAGES_AT_THE_END if n_episodes is None else (n_episodes,)
+        if n_episodes is None and stages[0] * (self._last_length or math.inf) > left:
             stages = (STAGES[0], *stages)
-        seed = evaluation_seed(self.seed, 2)
         return self._evaluate(model, stages, PRECISION_AT_THE_END, left, seed)
 
     def _evaluate(
-        self,
-        model: BaseAlgorithm,
-        stages: tuple[int, ...],
-        within: float,
-        most: float,
-        seed: int,
+        self, model: BaseAlgorithm, stages: tuple[int, ...], within: float, most: float, seed: int
     ) -> Evaluation:
         """Play episodes until the mean is precise enough, or the allowed steps are used up."""
         copy = self._compiled_copy(model)
@@ -323,18 +275,11 @@ class SampledEvaluator:
             found = found.joined(play(n_more, None))
         self.n_steps += int(found.lengths.sum())
         self._last_length = found.mean_length
-        return found.measured_by(self.yardstick)
+        return replace(found, yardstick=self.yardstick)
 
     def _allowed(self, model: BaseAlgorithm, n_trained: float) -> float:
         is_compiled = self._compiled_copy(model) is not None
         return allowed_steps(n_trained, shares_of(model, plays_compiled=is_compiled))
-
-    def _usual_length(self, model: BaseAlgorithm) -> float:
-        """Mean steps of an episode in the last evaluation, or else in training's last episodes."""
-        if self._last_length is not None:
-            return self._last_length
-        lengths = [episode["l"] for episode in getattr(model, "ep_info_buffer", None) or ()]
-        return float(np.mean(lengths[-STAGES[0] :])) if lengths else 1.0
 
     def _compiled_copy(self, model: BaseAlgorithm) -> CompiledCopy | None:
         """The compiled evaluation environments, if the agent trains in compiled code."""
@@ -355,15 +300,6 @@ def n_environments(n_eval_envs: int, n_episodes: int | None) -> int:
     return min(n_eval_envs, STAGES[0] if n_episodes is None else n_episodes)
 
 
-@dataclass(frozen=True)
-class CompiledCopy:
-    """Evaluation environments and their compiled counterpart."""
-
-    env: DummyVecEnv
-    world: Any  # the compiled environments, for `agents.compiled.loop`
-    seen: Any  # converts their observations
-
-
 def compiled_copy(env: VecEnv) -> CompiledCopy | None:
     """The compiled copy of CartPole or MountainCar, plain or in Monitor; None for others."""
     from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
@@ -376,7 +312,7 @@ def compiled_copy(env: VecEnv) -> CompiledCopy | None:
     if not isinstance(env.envs[0].unwrapped, CartPoleEnv | MountainCarEnv):
         return None
     try:
-        return CompiledCopy(env, *observed_world(env))
+        return (env, *observed_world(env))
     except NotCompilable:
         return None
 
@@ -389,15 +325,14 @@ def evaluate_compiled(
     from rl_yardstick.agents.compiled.env_states import DECIMALS, EnvStates
     from rl_yardstick.agents.networks.perceptron import one_thread
 
-    env, n_envs = copy.env, copy.env.num_envs
+    env, world, seen = copy
     if seed is not None:
         env.seed(seed)
     # As many episodes per environment as in `evaluate_policy`.
-    wanted = (n_episodes + np.arange(n_envs)) // n_envs
-    states = EnvStates(env, copy.world, copy.seen)
-    acting = cast(Any, model).greedy_player(copy.seen)
+    wanted = (n_episodes + np.arange(env.num_envs)) // env.num_envs
+    states, acting = EnvStates(env, world, seen), cast(Any, model).greedy_player(seen)
     with one_thread() if is_network(model) else nullcontext():
-        found = play_episodes(copy.world, acting, states, env.reset(), wanted)
+        found = play_episodes(world, acting, states, env.reset(), wanted)
     # Rounded as in Monitor.
     returns = np.array([round(total, DECIMALS) for total in found.returns.tolist()])
     when = f"in the evaluation at step {model.num_timesteps:,}"

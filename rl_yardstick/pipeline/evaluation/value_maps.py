@@ -6,7 +6,6 @@ deterministic policy from there, with the whole time limit left; not the agent's
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from rl_yardstick.pipeline.files import replacing
 MAX_STATES = 2500
 # More maps than a slider can resolve.
 MAX_MAPS = 400
-SECONDS_BETWEEN_WRITES = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +49,15 @@ class ValueMap:
 
 def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | None:
     """The map of an agent with one action per state, on a grid of up to 2500 states; else None."""
-    policy = best_actions_of(evaluator, agent) if _can_be_drawn(evaluator) else None
-    if policy is None or evaluator.layout is None:
+    model, layout = evaluator.model, evaluator.layout
+    if layout is None or model.n_states > MAX_STATES:
         return None
-    model = evaluator.model
+    policy = best_actions_of(evaluator, agent)
+    if policy is None:
+        return None
     optimal_values, optimal_actions = evaluator.optimum
     return ValueMap(
-        layout=evaluator.layout,
+        layout=layout,
         matters=model.reachable,
         initial=model.initial,
         values=evaluator.values(policy),
@@ -69,18 +69,6 @@ def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | Non
     )
 
 
-def map_refusal(evaluator: ExactEvaluator) -> str | None:
-    """Why a grid world has no map; None if it has one, or is no grid world."""
-    n_states = evaluator.model.n_states
-    if evaluator.layout is None or n_states <= MAX_STATES:
-        return None
-    return f"no value map: {n_states:,} states, the limit is {MAX_STATES:,}"
-
-
-def _can_be_drawn(evaluator: ExactEvaluator) -> bool:
-    return evaluator.layout is not None and evaluator.model.n_states <= MAX_STATES
-
-
 def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | None:
     """Actions at each step and state, shape (1 or horizon, S); None if the policy is random."""
     policy = evaluator.policy(agent, deterministic=True)
@@ -90,49 +78,41 @@ def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | N
 
 
 class ValueMapRecorder:
-    """Records the maps of an agent over its training in the file ``path``.
+    """Records the maps of an agent at its evaluations; on a grid, in the file ``path``.
 
     The file has `timesteps` (T,), `values` (T, S), `actions` (T, S), `optimal_values` (S,) and
     `optimal_actions` (S, A), as in `ValueMap`. Of too many maps it keeps every 2nd, 4th, ... one.
     """
 
     def __init__(self, path: Path, evaluator: ExactEvaluator) -> None:
-        self.path = path
-        self.evaluator = evaluator
-        self._maps: list[tuple[int, Floats, Ints]] = []
-        self._calls = 0
-        self._stride = 1
-        self._last_write = time.monotonic()
+        self.path, self.evaluator = path, evaluator
+        # number of the evaluation, time steps, values (S,), actions (S,)
+        self.moments: list[tuple[int, int, Floats, Ints]] = []
+        self.stride, self.n_units = 1, 0  # evaluations, one in ``stride`` of which is kept
 
-    def record(self, agent: BaseAlgorithm, timesteps: int) -> None:
-        """Record the map of the current agent after ``timesteps`` steps."""
-        if len(self._maps) >= MAX_MAPS:
-            self._maps = self._maps[1::2]
-            self._stride *= 2
-        self._calls += 1
-        if self._calls % self._stride:
+    def count(self, agent: BaseAlgorithm) -> None:
+        """Count an evaluation, and record its map if its number is a multiple of the stride."""
+        self.n_units += 1
+        if self.n_units % self.stride == 0:
+            self._append(agent)
+        if len(self.moments) > MAX_MAPS:
+            self.stride *= 2
+            self.moments = [moment for moment in self.moments if moment[0] % self.stride == 0]
+
+    def _append(self, agent: BaseAlgorithm) -> None:
+        if self.evaluator.model.n_states > MAX_STATES:
             return
-        self._append(agent, timesteps)
-        # Flushing a file to disk takes longer than an evaluation.
-        if time.monotonic() - self._last_write > SECONDS_BETWEEN_WRITES:
-            self._write()
-
-    def finish(self, agent: BaseAlgorithm, timesteps: int) -> None:
-        """Record the map at the end of training, and write all maps that are not written yet."""
-        if not self._maps or self._maps[-1][0] != timesteps:
-            self._append(agent, timesteps)
-        self._write()
-
-    def _append(self, agent: BaseAlgorithm, timesteps: int) -> None:
-        policy = best_actions_of(self.evaluator, agent) if _can_be_drawn(self.evaluator) else None
-        if policy is not None:
-            values = self.evaluator.values(policy)
-            self._maps.append((timesteps, values, policy[0]))
-
-    def _write(self) -> None:
-        if not self._maps:
+        now, policy = (self.n_units, agent.num_timesteps), best_actions_of(self.evaluator, agent)
+        if policy is None or (self.moments and self.moments[-1][1] == agent.num_timesteps):
             return
-        timesteps, values, actions = zip(*self._maps, strict=True)
+        self.moments.append((*now, self.evaluator.values(policy), policy[0]))
+
+    def finish(self, agent: BaseAlgorithm) -> None:
+        """Record the map at the end of training, and write all maps."""
+        self._append(agent)
+        if self.evaluator.layout is None or not self.moments:
+            return
+        _, timesteps, values, actions = zip(*self.moments, strict=True)
         optimal_values, optimal_actions = self.evaluator.optimum
         arrays: dict[str, Any] = {
             "timesteps": timesteps,
@@ -143,4 +123,3 @@ class ValueMapRecorder:
         }
         with replacing(self.path) as beside:
             np.savez(beside, **arrays)
-        self._last_write = time.monotonic()

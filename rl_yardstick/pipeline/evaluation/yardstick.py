@@ -5,12 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-# A run with a lower score has failed; at least this share of episodes counts as all.
-FAILED, NEARLY_ALL = 0.05, 0.99
-
-# Returns closer than this differ only by rounding.
-ROUNDING = 1e-12
-
+FAILED = 0.05  # a run with a lower score has failed
+ROUNDING = 1e-12  # returns closer than this differ only by rounding
 # If the gap is smaller, relative to baseline and optimum, scores are meaningless.
 LEAST_WAY = 0.01
 

@@ -21,13 +21,13 @@ from rl_yardstick.experiments.pool import process_pool
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.errors import UserError, one_line
-from rl_yardstick.pipeline.evaluation.value_maps import MAX_STATES
+from rl_yardstick.pipeline.evaluation.value_maps import MAX_STATES, ValueMapRecorder
 from rl_yardstick.pipeline.files import read_bytes, read_json, write_json, write_text
 from rl_yardstick.pipeline.models import MAX_MODEL
 from rl_yardstick.pipeline.modules import import_modules
 from rl_yardstick.pipeline.run import RECORD, Run, Stop
 from rl_yardstick.pipeline.spec import TrainSpec
-from rl_yardstick.pipeline.watching import LOGGED, MapRecorder, TableRecorder, Watch
+from rl_yardstick.pipeline.watching import TableRecorder, Watch
 from rl_yardstick.report.page import frame
 from rl_yardstick.report.page.frame import LearningPage, first_runs
 from rl_yardstick.safe_files.archives import read_members
@@ -36,22 +36,17 @@ from rl_yardstick.safe_files.archives import read_members
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
     """The template's variables whose words depend on the data."""
     if data["kind"] == "maps":
-        unit, stride = data["unit"], data["stride"]
-        extent = _count(data["n_units"], unit)
+        extent, stride = _count(data["n_units"], "evaluation"), data["stride"]
         extent += f", one in {stride:,} of which is shown" if stride > 1 else ""
-        is_update = unit == "update"
-        note = "an update: all learning from one rollout, at its end" if is_update else ""
-        return {"kind": f"from {unit} to {unit}", "extent": extent, "note": note}
+        return {"kind": "from evaluation to evaluation", "extent": extent, "note": ""}
     steps, note = data["steps"]["timesteps"], ""
     if data["is_cut"] and spec.watch_episodes:
         asked = _count(spec.watch_episodes, "episode")
         note = f"a page has room for {len(steps):,} steps, and ends before the first {asked} do"
-    elif data["begin"]:
-        note = "these steps, as the return of the greedy policy rises in them"
     elif data["is_longer"] and not spec.watch_episodes:
         note = "the beginning of a longer training"
     extent = _count(len(steps), "step")
-    if data["begin"] or data["is_longer"]:
+    if data["is_longer"]:
         extent = f"steps {steps[0]:,} to {steps[-1]:,} of {data['n_timesteps']:,}"
     extent += f", {_count(int(np.count_nonzero(data['moves']['end'])), 'whole episode')}"
     return {"kind": "step by step", "extent": extent, "note": note}
@@ -62,40 +57,19 @@ def _count(number: int, word: str) -> str:
 
 
 def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
-    """At most ``most_steps`` steps of a tabular agent.
-
-    They are the first ones if the first episodes were asked for, else the last: the return rises.
-    """
-    begin, end = recorder.window()
-    if recorder.n_episodes:
-        end = min(end, begin + most_steps)
-    else:
-        begin = max(begin, end - most_steps)
-    steps = recorder.steps.rows[begin:end]
-    # The tables before the first of the steps.
-    tables = {name: recorder.initial[name].copy() for name in recorder.names}
-    earlier = recorder.changes.rows[recorder.changes.rows["step"] < begin]
-    for number, table in enumerate(tables.values()):
-        moved = earlier[earlier["table"] == number]
-        table.reshape(-1)[moved["entry"]] = moved["after"]  # the last change of an entry holds
+    """The first ``most_steps`` recorded steps of a tabular agent."""
+    rows = recorder.rows()
+    steps, moves, changes = rows["steps"][:most_steps], rows["moves"], rows["changes"]
     return {
         "kind": "steps",
-        "tables": [_table(name, table) for name, table in tables.items()],
+        "tables": [_table(name, table) for name, table in recorder.initial.items()],
         "steps": _columns(steps),
-        "moves": _columns(_between(recorder.moves.rows, begin, end)),
-        "changes": _columns(_between(recorder.changes.rows, begin, end)),
-        "begin": begin,
-        "is_cut": recorder.is_cut or end - begin < len(recorder.steps),
+        "moves": _columns(moves[moves["step"] < most_steps]),
+        "changes": _columns(changes[changes["step"] < most_steps]),
+        "is_cut": recorder.is_cut or most_steps < len(recorder.steps),
         "n_timesteps": recorder.model.num_timesteps,
         "is_longer": recorder.model.num_timesteps > steps["timesteps"][-1],
     }
-
-
-def _between(rows: NDArray[np.void], begin: int, end: int) -> NDArray[np.void]:
-    """The rows of steps ``begin`` to ``end`` (exclusive), with steps numbered from 0."""
-    chosen = rows[(rows["step"] >= begin) & (rows["step"] < end)].copy()
-    chosen["step"] -= begin
-    return chosen
 
 
 def _columns(rows: NDArray[np.void]) -> dict[str, Any]:
@@ -110,27 +84,24 @@ def _table(name: str, values: Floats) -> dict[str, Any]:
     return {"name": name, "shape": values.shape, **initial}
 
 
-def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
+def maps_data(recorder: ValueMapRecorder, stride: int) -> dict[str, Any]:
     """An agent's policy, and the policy's value in every state, in the course of training.
 
-    Every ``stride``-th update or evaluation is shown, and the last in any case.
+    Every ``stride``-th evaluation is shown, and the last in any case.
     """
-    evaluator, rows = recorder.evaluator, recorder.moments.rows
-    shown = rows[(rows["number"] % stride == 0) | (np.arange(len(rows)) == len(rows) - 1)]
+    evaluator, last = recorder.evaluator, len(recorder.moments) - 1
+    shown = [m for i, m in enumerate(recorder.moments) if m[0] % stride == 0 or i == last]
+    numbers, timesteps, values, actions = map(np.array, zip(*shown, strict=True))
     reachable = evaluator.model.reachable
     optimal = evaluator.optimum[0][reachable]
-    moments = {
-        **_columns(shown),
-        "values": np.where(reachable, shown["values"], np.nan),
-        "return": shown["values"] @ evaluator.model.initial,
-    }
+    moments = {"number": numbers, "timesteps": timesteps, "actions": actions}
+    moments["values"] = np.where(reachable, values, np.nan)
+    moments["return"] = values @ evaluator.model.initial
     return {
         "kind": "maps",
-        "unit": recorder.unit,
         "n_units": recorder.n_units,
         "stride": stride,
         "moments": moments,
-        "logged": LOGGED,
         "optimum": evaluator.yardstick.optimum,
         "optimal_range": [optimal.min(), optimal.max()],
     }
@@ -140,7 +111,7 @@ def place_data(spec: TrainSpec, recorder: Watch) -> dict[str, Any]:
     """The layout of the states, and the names of the actions."""
     layout: GridLayout | None = None
     n_states = n_actions = 0
-    if isinstance(recorder, MapRecorder):
+    if isinstance(recorder, ValueMapRecorder):
         model, layout = recorder.evaluator.model, recorder.evaluator.layout
         n_states, n_actions = model.n_states, model.n_actions
     elif recorder.has_actions:
@@ -198,15 +169,13 @@ def write_learning_page(spec: TrainSpec, recorder: Watch, path: Path, title: str
 
 def _ever_less(recorder: Watch) -> Iterator[dict[str, Any]]:
     """The recorded data, then ever less: 3/4 of the steps, or half of the maps, and so on."""
-    if isinstance(recorder, MapRecorder):
-        recorder.finish()
+    if isinstance(recorder, ValueMapRecorder):
         stride = recorder.stride
         while stride < 2 * max(recorder.n_units, recorder.stride):
             yield maps_data(recorder, stride)
             stride *= 2
         return
-    begin, end = recorder.window()
-    n_steps = end - begin
+    n_steps = len(recorder.steps)
     while n_steps:
         yield steps_data(recorder, n_steps)
         n_steps = n_steps * 3 // 4

@@ -1,8 +1,8 @@
 "use strict";
 
-// A page of maps: one before the training, and one after each update or evaluation.
+// A page of maps: one at each evaluation.
 const mapShow = (data) => {
-  const { moments, unit } = data;
+  const { moments } = data;
   const { timesteps } = moments;
   // Colours span the optimal values, and as much again below them.
   const [lowest, high] = data.optimal_range;
@@ -14,17 +14,7 @@ const mapShow = (data) => {
   document.getElementById("legend").textContent = `${data.layout === null ? "Each square is a state; number: the agent's action there" : "Arrows: the agent's action in each cell"}. Colour: the expected return of that policy from there on, computed from the model of the environment (from ${shown(low)}${least < low ? " and below" : ""} to ${shown(high)}). Framed: where the action has changed.`;
   const [begin, end] = [timesteps[0], Math.max(timesteps.at(-1), timesteps[0] + 1)];
   const place = (position) => (timesteps[position] - begin) / (end - begin);
-  // For each figure of an agent: its word here, its column, and its name in the logger.
-  const figures = [
-    ["Return of the policy, computed", "return", null],
-    ["Return of the last training episodes, mean", "training_return", null],
-    ["Exploration", "exploration", null],
-    ["Loss", "loss", data.logged.loss],
-    ["Loss of the policy", "policy_loss", data.logged.policy_loss],
-    ["Loss of the value network", "value_loss", data.logged.value_loss],
-    ["Loss of entropy", "entropy_loss", data.logged.entropy_loss],
-  ].filter(([, name]) => moments[name].some((value) => value !== null));
-  const curves = figures.map(([word, name]) => curveOf(word, moments[name].map((value, i) => [place(i), value]))).filter((curve) => curve !== null);
+  const curves = [curveOf("Return of the policy, computed", moments.return.map((value, i) => [place(i), value]))].filter((curve) => curve !== null);
   // If prizes belong to the state, a map for each set of collected prizes that episodes can reach.
   const nCells = data.layout === null ? data.n_states : data.n_states / data.layout.layers.length;
   const layers = (data.layout?.layers ?? [[]]).flatMap((cells, layer) => {
@@ -50,18 +40,13 @@ const mapShow = (data) => {
     board.svg.setAttribute("aria-label", `The agent's policy on the map after ${timesteps[position]} steps`);
     document.getElementById("readout").replaceChildren(listOf([
       ["environment steps", shown(timesteps[position], 12)],
-      ...figures.map(([word, name, logged]) => {
-        const value = shown(moments[name][position]);
-        const words = name === "return" ? `${value} (optimum ${shown(data.optimum)})` : value;
-        return [logged === null ? word.toLowerCase() : logged, words];
-      }),
+      ["return of the policy, computed", `${shown(moments.return[position])} (optimum ${shown(data.optimum)})`],
       ["changed its action", `in ${changed.length} state${changed.length === 1 ? "" : "s"}${layers.length > 1 ? ", with any prizes" : ""}`],
     ]));
     curves.forEach((curve) => curve.go(place(position)));
     const number = moments.number[position];
-    if (position === 0) return "before the training";
     if (number === moments.number[position - 1]) return "at the end";
-    return `${unit} ${number.toLocaleString("en")} of ${data.n_units.toLocaleString("en")}`;
+    return `evaluation ${number.toLocaleString("en")} of ${data.n_units.toLocaleString("en")}`;
   };
   pick.addEventListener("change", () => draw(shownNow));
   return {
