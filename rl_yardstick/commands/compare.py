@@ -133,7 +133,7 @@ def _margin(text: str) -> float:
 def main() -> int:
     """Do a study, or judge policies on a log; return the exit code."""
     args = build_parser().parse_args()
-    from rl_yardstick.pipeline.modules import check_typed, import_modules, split_id
+    from rl_yardstick.pipeline.components import check_typed, import_modules, split_id
     from rl_yardstick.pipeline.run import Stop
 
     stop = Stop().listen()

@@ -7,11 +7,12 @@ Importing an agent takes two seconds, for torch. So the signatures of the regist
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import json
 import math
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,42 +25,31 @@ TABLE = Path(__file__).parents[1] / "hyperparams" / "arguments.json"
 
 # Arguments that a flag or another key sets.
 _SET_ELSEWHERE = {"env", "seed", "device", "verbose", "tensorboard_log", "action_noise"}
-_INTERNAL = {"self", "_init_setup_model"}
+_INTERNAL = {"self", "_init_setup_model", "venv", "filename"}
 _PLAIN = {"bool": bool, "int": int, "float": float, "str": str, "dict": dict, "list": list}
-_SCHEDULES = ("lin_", "exp_")
+_WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a text"}
+_WORDS |= {"schedule": "a schedule such as lin_0.001", "dict": "a mapping", "list": "a list"}
+_WORDS |= {"None": "none"}
 
 # Ranges that hold for every agent; an agent's own checks come when it is made.
-_SHARE, _FROM_ZERO, _FROM_ONE = Field(ge=0, le=1), Field(ge=0), Field(ge=1, le=2**62)
-_RANGES: dict[str, Any] = {
-    **dict.fromkeys(("gamma", "gae_lambda", "tau", "exploration_fraction"), _SHARE),
-    **dict.fromkeys(("exploration_initial_eps", "exploration_final_eps"), _SHARE),
-    **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "buffer_size"), _FROM_ONE),
-    **dict.fromkeys(("train_freq", "target_update_interval", "stats_window_size"), _FROM_ONE),
-    **dict.fromkeys(("learning_starts", "temperature", "vf_coef", "target_kl"), _FROM_ZERO),
-    **dict.fromkeys(("clip_range", "clip_range_vf", "rms_prop_eps", "max_grad_norm"), _FROM_ZERO),
-    **dict.fromkeys(("gradient_steps", "sde_sample_freq"), Field(ge=-1)),  # -1: each step, never
+_RANGES = {
+    "gamma gae_lambda tau": Field(ge=0, le=1),
+    "exploration_fraction exploration_initial_eps exploration_final_eps": Field(ge=0, le=1),
+    "n_steps batch_size n_epochs buffer_size": Field(ge=1, le=2**62),
+    "train_freq target_update_interval stats_window_size": Field(ge=1, le=2**62),
+    "learning_starts temperature vf_coef target_kl": Field(ge=0),
+    "clip_range clip_range_vf rms_prop_eps max_grad_norm": Field(ge=0),
+    "gradient_steps sde_sample_freq": Field(ge=-1),  # -1: each step, never
     # Larger rates overflow single precision in the first update.
     "learning_rate": Field(ge=0, le=1e37),
 }
-# Arguments of VecNormalize and Monitor that an entry may give.
-_KEYWORDS = {
-    "normalize": {
-        **{key: ["bool"] for key in ("training", "norm_obs", "norm_reward")},
-        **{key: ["float"] for key in ("clip_obs", "clip_reward", "gamma", "epsilon")},
-        "norm_obs_keys": ["None", "list"],
-    },
-    "monitor_kwargs": {
-        **{key: ["bool"] for key in ("allow_early_resets", "override_existing")},
-        **{key: ["list"] for key in ("reset_keywords", "info_keywords")},
-    },
+_RANGE_OF: dict[str, Any] = {name: r for names, r in _RANGES.items() for name in names.split()}
+AUTO = ("gamma", "learning_rate", "initial_q", "value_bound")  # which may be ``auto``
+# Keys of an entry that hold arguments of a class of the library's.
+WRAPPERS = {
+    "normalize": "stable_baselines3.common.vec_env:VecNormalize",
+    "monitor_kwargs": "stable_baselines3.common.monitor:Monitor",
 }
-AUTO = ("gamma", "learning_rate", "initial_q", "value_bound")
-
-
-def arguments_of(algo: str) -> dict[str, list[str]]:
-    """The arguments that hyperparameters may set: names, and the kinds of value each takes."""
-    table = _table()
-    return table[algo] if algo in table else read_signature(algo)
 
 
 @cache
@@ -68,19 +58,26 @@ def _table() -> dict[str, dict[str, list[str]]]:
     return found
 
 
+def arguments_of(algo: str) -> dict[str, list[str]]:
+    """The arguments that hyperparameters may set: names, and the kinds of value each takes."""
+    return _table()[algo] if algo in _table() else read_signature(algo)
+
+
 def known_names() -> set[str]:
     """The arguments of all registered agents."""
-    return {name for arguments in _table().values() for name in arguments}
+    return {name for algo in _table().keys() - WRAPPERS for name in _table()[algo]}
 
 
-def read_signature(algo: str) -> dict[str, list[str]]:
-    """Import the agent's class and read its signature."""
+def read_signature(name: str) -> dict[str, list[str]]:
+    """Import the class of an agent, or of a key of `WRAPPERS`, and read its signature."""
     from rl_yardstick.agents import load_algorithm
 
-    left_out = _SET_ELSEWHERE | _INTERNAL
-    found = constructor_parameters(load_algorithm(algo))
+    module, _, cls = WRAPPERS.get(name, "").partition(":")
+    found = constructor_parameters(
+        getattr(importlib.import_module(module), cls) if module else load_algorithm(name)
+    )
     kinds = {name: sorted(_kinds(p.annotation, p.default)) for name, p in found.items()}
-    return {name: kinds[name] for name in kinds if name not in left_out}
+    return {name: kinds[name] for name in kinds if name not in _SET_ELSEWHERE | _INTERNAL}
 
 
 def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
@@ -111,14 +108,13 @@ def _kinds(annotation: Any, default: Any = None) -> set[str]:
         name = annotation.partition("[")[0]
         return {name if name in _PLAIN else "schedule" if name == "Schedule" else "any"}
     if annotation is inspect.Parameter.empty and type(default) in (int, float):
-        return {type(default).__name__}
-    if isinstance(annotation, type) and annotation.__name__ in _PLAIN:
-        return {annotation.__name__}
+        annotation = type(default)
     origin, members = typing.get_origin(annotation), typing.get_args(annotation)
+    name = getattr(origin or annotation, "__name__", "")
+    if name in _PLAIN:
+        return {name}
     if origin is Literal:
         return {f"={word}" for word in members}
-    if origin in (dict, list):
-        return {origin.__name__}
     if origin is Sequence:
         return {"list"}
     if Callable in (annotation, origin):
@@ -128,25 +124,21 @@ def _kinds(annotation: Any, default: Any = None) -> set[str]:
     return {"any"}
 
 
-def check_arguments(algo: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def check_arguments(owner: str, values: Any, where: str = "") -> dict[str, Any]:
     """The values of constructor arguments, each of its type (``"1e-4"`` becomes a number).
 
+    ``owner`` is an agent, or a key of `WRAPPERS`; ``where`` begins every message.
+
     Raises:
-        UserError: for a value that is not of its type or range.
+        UserError: for an argument that does not exist, or a value not of its type or range.
     """
-    known = arguments_of(algo)
-    return {name: _checked(name, value, known[name]) for name, value in values.items()}
-
-
-def check_keywords(key: str, given: Any) -> dict[str, Any]:
-    """The arguments of VecNormalize or Monitor under a key of an entry."""
-    if not isinstance(given, dict):
-        raise UserError(f"{key} must be a mapping, not {shown(given)}")
-    known = _KEYWORDS[key]
-    for name in given:
+    if not isinstance(values, dict):
+        raise UserError(f"{owner} must be a mapping, not {shown(values)}")
+    known = arguments_of(owner)
+    for name in values:
         if name not in known:
-            raise unknown(f"{key}: unknown argument", str(name), known)
-    return {name: _checked(f"{key}: {name}", value, known[name]) for name, value in given.items()}
+            raise unknown(f"{where}unknown argument", str(name), known)
+    return {name: _checked(f"{where}{name}", value, known[name]) for name, value in values.items()}
 
 
 def _checked(name: str, value: Any, kinds: list[str]) -> Any:
@@ -158,35 +150,30 @@ def _checked(name: str, value: Any, kinds: list[str]) -> Any:
     if isinstance(value, str):
         if f"={value}" in kinds or (value == "auto" and name in AUTO):
             return value
-        if "schedule" in kinds and value.startswith(_SCHEDULES):
+        if "schedule" in kinds and value.startswith(("lin_", "exp_")):
             return value
+    described = " or ".join(_WORDS.get(kind, kind.lstrip("=")) for kind in kinds)
+    fault = f"{name} must be {described}, not {shown(value)}"
     plain = [_PLAIN[kind] for kind in kinds if kind in _PLAIN]
     if (isinstance(value, bool) and bool not in plain) or not plain:
-        raise UserError(f"{name} must be {_described(kinds)}, not {shown(value)}")
+        raise UserError(fault)
+    limits = _RANGE_OF.get(name)
     expected: Any = typing.Union[tuple(plain)]  # noqa: UP007
-    if name in _RANGES and str not in plain:
-        expected = Annotated[expected, _RANGES[name]]
     try:
-        found = TypeAdapter(expected).validate_python(value)
+        given = expected if limits is None or str in plain else Annotated[expected, limits]
+        found = TypeAdapter(given).validate_python(value)
     except ValidationError as error:
         reason = error.errors()[0]["msg"]
-        reason = f": {reason[0].lower()}{reason[1:]}" if name in _RANGES else ""
-        described = _described(kinds)
-        raise UserError(f"{name} must be {described}, not {shown(value)}{reason}") from None
+        reason = f": {reason[0].lower()}{reason[1:]}" if limits is not None else ""
+        raise UserError(f"{fault}{reason}") from None
     if isinstance(found, float) and not math.isfinite(found) and name != "max_grad_norm":
         raise UserError(f"{name} must be finite, not {shown(value)}")
     return found
 
 
-def _described(kinds: list[str]) -> str:
-    names = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a text"}
-    names |= {"schedule": "a schedule such as lin_0.001", "dict": "a mapping", "list": "a list"}
-    names |= {"None": "none"}
-    return " or ".join(names.get(kind, kind.lstrip("=")) for kind in kinds)
-
-
 if __name__ == "__main__":
     from rl_yardstick.agents import ALGORITHMS
 
-    signatures = {a: read_signature(a) for a, entry in ALGORITHMS.items() if entry.is_installed}
+    names = [name for name, entry in ALGORITHMS.items() if entry.is_installed]
+    signatures = {name: read_signature(name) for name in (*names, *WRAPPERS)}
     TABLE.write_text(json.dumps(signatures, indent=1) + "\n", encoding="utf-8")

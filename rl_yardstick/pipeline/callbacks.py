@@ -1,4 +1,4 @@
-"""Callbacks of a training: evaluations, checkpoints, states, checks of numbers, pulls."""
+"""Callbacks of a training: evaluations, checkpoints, states, pulls, progress, time."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import pickle
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
@@ -28,43 +29,39 @@ from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
 from rl_yardstick.pipeline.files import replacing
-from rl_yardstick.pipeline.finite_numbers import (
-    NotFiniteError,
-    check_model,
-    check_numbers,
-    check_rows,
-    is_finite,
-)
-from rl_yardstick.pipeline.run import LAST_PULLS, PULLS_FILE, Run
+from rl_yardstick.pipeline.finite_numbers import check_model
+from rl_yardstick.pipeline.run import LAST_PULLS, PULLS_FILE, Run, save_agent
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.pipeline.states import load_state, roots_of, save_state
 
 # --- checkpoints, and exploration that decays per update ------------------------------------------
 
 
-class StepCheckpoint(BlockCallback):
-    """Saves ``rl_model_<steps>_steps.zip`` every ``every_n_steps`` steps of all environments."""
+class Checkpoint(BlockCallback):
+    """Saves ``rl_model_<steps>_steps.zip`` every so many steps or episodes of all environments.
 
-    def __init__(self, run: Run, every_n_steps: int, with_replay_buffer: bool = False) -> None:
+    Args:
+        every_n_steps: steps between two checkpoints; None if episodes are counted.
+        every_n_episodes: episodes between two checkpoints.
+        save_path: the folder.
+        with_replay_buffer: whether the replay buffer and VecNormalize's statistics lie beside.
+    """
+
+    def __init__(
+        self,
+        every_n_steps: int | None = None,
+        every_n_episodes: int = 0,
+        save_path: str = "",
+        with_replay_buffer: bool = False,
+    ) -> None:
         super().__init__()
-        self.run, self.every_n_steps = run, every_n_steps
-        self.with_replay_buffer = with_replay_buffer
-
-    def _on_step(self) -> bool:
-        save_checkpoint(self.run, self.model, self.with_replay_buffer)
-        return True
-
-
-class EpisodeCheckpoint(BlockCallback):
-    """Saves a checkpoint every ``every_n_episodes`` episodes of all environments."""
-
-    def __init__(self, run: Run, every_n_episodes: int, with_replay_buffer: bool = False) -> None:
-        super().__init__()
-        self.run, self.every_n_episodes = run, every_n_episodes
-        self.with_replay_buffer = with_replay_buffer
+        self.every_n_steps, self.every_n_episodes = every_n_steps, every_n_episodes
+        self.folder, self.with_replay_buffer = Path(save_path), with_replay_buffer
         self.episodes_seen = 0
 
     def horizon(self) -> Horizon:
+        if self.every_n_steps is not None:
+            return super().horizon()
         return Horizon(episodes=calls_until_multiple(self.episodes_seen, self.every_n_episodes))
 
     def pass_over(self, n_calls: int, n_episodes: int) -> None:
@@ -72,20 +69,18 @@ class EpisodeCheckpoint(BlockCallback):
         self.episodes_seen += n_episodes
 
     def _on_step(self) -> bool:
-        before = self.episodes_seen
-        self.episodes_seen += int(np.sum(self.locals["dones"]))
-        if self.episodes_seen // self.every_n_episodes > before // self.every_n_episodes:
-            save_checkpoint(self.run, self.model, self.with_replay_buffer)
+        if self.every_n_steps is None:
+            before = self.episodes_seen
+            self.episodes_seen += int(np.sum(self.locals["dones"]))
+            if self.episodes_seen // self.every_n_episodes == before // self.every_n_episodes:
+                return True
+        model: Any = self.model
+        save_agent(model, self.folder / f"rl_model_{model.num_timesteps}_steps.zip")
+        if self.with_replay_buffer and getattr(model, "replay_buffer", None) is not None:
+            name = f"rl_model_replay_buffer_{model.num_timesteps}_steps.pkl"
+            with replacing(self.folder / name) as beside:
+                model.save_replay_buffer(beside)
         return True
-
-
-def save_checkpoint(run: Run, model: Any, with_replay_buffer: bool) -> None:
-    """Save the current agent, its statistics, and its replay buffer, if that is asked for."""
-    steps = model.num_timesteps
-    run.save(model, run.path / f"rl_model_{steps}_steps.zip")
-    if with_replay_buffer and getattr(model, "replay_buffer", None) is not None:
-        with replacing(run.path / f"rl_model_replay_buffer_{steps}_steps.pkl") as beside:
-            model.save_replay_buffer(beside)
 
 
 class ExponentialExploration(BaseCallback):
@@ -112,10 +107,9 @@ class ExponentialExploration(BaseCallback):
             raise UserError(f"ExponentialExploration is for DQN and subclasses, not for {name}")
 
     def _on_rollout_start(self) -> None:
-        updates = self.model._n_updates
-        epsilon = max(self.final_eps, self.initial_eps * self.decay**updates)
-        # The algorithm reads its schedule after each step: it must equal the current rate.
         model: Any = self.model
+        epsilon = max(self.final_eps, self.initial_eps * self.decay**model._n_updates)
+        # The algorithm reads its schedule after each step: it must equal the current rate.
         model.exploration_schedule = ConstantSchedule(epsilon)
         model.exploration_rate = epsilon
 
@@ -123,7 +117,7 @@ class ExponentialExploration(BaseCallback):
         return True
 
 
-# --- states ---------------------------------------------------------------------------------------
+# --- states, time and progress --------------------------------------------------------------------
 
 
 class StateCallback(BlockCallback):
@@ -141,38 +135,34 @@ class StateCallback(BlockCallback):
     takes_blocks = True
     share_of_time, shortest_pause = 0.02, 1.0
 
-    def __init__(self, run: Run, resumes: bool, clock: Any, judge: Judge) -> None:
+    def __init__(
+        self, run: Run, resumes: bool, clock: Clock, judge: Judge, others: list[BaseCallback]
+    ) -> None:
         super().__init__()
-        self.run, self.resumes, self.clock = run, resumes, clock
-        self.evaluator = judge.evaluator
+        self.run, self.resumes, self.clock, self.others = run, resumes, clock, others
         self.process = {"run": run, "exact": judge.exact, "eval_env": judge.env}
+        self.evaluator = {} if judge.exact is not None else {"evaluator": judge.evaluator}
         self.is_possible = True
-        self.others: list[BaseCallback] = []
-        self.saved_at, self.pause = time.monotonic(), self.shortest_pause
+        self.due_at = time.monotonic() + self.shortest_pause
 
     def wants_position(self) -> bool:
-        return self.resumes or self._is_due() or bool(self.run.stop.number)
-
-    def _is_due(self) -> bool:
-        return self.is_possible and time.monotonic() - self.saved_at >= self.pause
-
-    def _roots(self) -> dict[str, Any]:
-        roots = roots_of(self.model, self.others, **self.process)
-        is_exact = self.evaluator is self.process["exact"]  # which has no state of its own
-        return roots if is_exact else {**roots, "evaluator": self.evaluator}
+        is_due = self.is_possible and time.monotonic() >= self.due_at
+        return self.resumes or is_due or bool(self.run.stop.number)
 
     def _on_rollout_start(self) -> None:
         if self.resumes:
             load_state(self.run.state_path, self._roots())
             self.resumes = False
             self.run.console.print(f"resuming at step {self.model.num_timesteps:,}")
-        elif self._is_due() or (self.is_possible and self.run.stop.number):
-            self.save()
+        elif self.is_possible and self.wants_position():
+            self._save()
         self.run.has_begun = True
         self.run.stop.check()
 
-    def save(self) -> None:
-        """Save the state; called between two updates."""
+    def _roots(self) -> dict[str, Any]:
+        return roots_of(self.model, self.others, **self.process, **self.evaluator)
+
+    def _save(self) -> None:
         begun = time.monotonic()
         self.clock.stop()
         try:
@@ -182,65 +172,83 @@ class StateCallback(BlockCallback):
             self.run.console.print(
                 f"no state can be saved, so the training cannot be resumed: {one_line(error)}"
             )
-        self.saved_at = time.monotonic()
-        self.pause = max((self.saved_at - begun) / self.share_of_time, self.shortest_pause)
+        now = time.monotonic()
+        self.due_at = now + max((now - begun) / self.share_of_time, self.shortest_pause)
 
     def _on_step(self) -> bool:
         return True
 
 
-# --- numbers that are not finite end a training ---------------------------------------------------
+class Clock(BlockCallback):
+    """The time of a training over all its starts, without compiling."""
 
-# Log entries of the library's agents. Others may be nan, as the explained variance of constants.
-_LOSSES = tuple(
-    f"train/{name}" for name in ("loss", "actor_loss", "critic_loss", "ent_coef_loss", "value_loss")
-)
-_NO_EPISODE: Mapping[str, float] = {"r": 0.0}
+    excluded_from_states = ("_begun", "_compiling")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.taken = WorkTime()
+
+    def start(self, time_compiling: Any) -> None:
+        """Begin to count."""
+        self._begun, self._compiling = WorkTime.now() - time_compiling(), time_compiling
+
+    def stop(self) -> None:
+        """Add the time since the start, and go on counting from here."""
+        now = WorkTime.now() - self._compiling()
+        self.taken, self._begun = self.taken + (now - self._begun), now
+
+    def _on_step(self) -> bool:
+        return True
 
 
-class NumberWatch(BlockCallback):
-    """Checks the numbers of each step (or of a compiled block's last step) and the losses."""
+UPDATES = 400  # of a training's bar
+SECONDS_BETWEEN_LINES = 10.0
 
-    takes_blocks = True
 
-    def update_locals(self, locals_: dict[str, Any]) -> None:
-        """Keep the training loop's variables without a copy, because this runs at each step."""
-        self.locals = locals_
+class ProgressCallback(BlockCallback):
+    """Tells the steps and the mean return of training's last episodes: a bar, or plain lines.
+
+    Args:
+        console: where it is told; the bar is for a terminal.
+        n_timesteps: steps of the training.
+        on_variant: whether training's environment differs from the one of evaluations.
+    """
+
+    excluded_from_states = ("console", "bar", "task", "told_at")
+
+    def __init__(self, console: Console, n_timesteps: int, on_variant: bool = False) -> None:
+        super().__init__()
+        self.console = console
+        self.where = "training (on a variant)" if on_variant else "training"
+        # A block of compiled training ends where a callback acts: nobody reads a quiet console.
+        few = min(max(n_timesteps // UPDATES, 1), 20_000)
+        self.every_n_steps = max(n_timesteps, 1) if console.quiet else few
+        columns = BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+        text, is_live = TextColumn("{task.description}"), console.is_terminal and not console.quiet
+        self.bar = Progress(*columns, text, console=console, transient=True, disable=not is_live)
+        self.task = self.bar.add_task("", total=1.0)
+        self.told_at = time.monotonic()
 
     def _on_training_start(self) -> None:
-        if self.model._last_obs is not None:
-            when = f"at step {self.model.num_timesteps:,}"
-            check_rows(self.model._last_obs, "observation", when)
-
-    def _on_rollout_start(self) -> None:
-        log = self.model.logger.name_to_value
-        for name in _LOSSES:
-            if name in log and not isfinite(log[name]):
-                raise NotFiniteError(f"{name} at step {self.model.num_timesteps:,}", log[name])
+        self.told_at = time.monotonic()
+        self.bar.start()
 
     def _on_step(self) -> bool:
-        seen = self.locals
-        # Algorithms that play whole episodes, such as ARS, pass other variables.
-        new_obs = seen.get("new_obs", seen.get("new_observations"))
-        rewards, actions = seen.get("rewards"), seen.get("actions")
-        if not (is_finite(rewards) and is_finite(new_obs) and is_finite(actions)):
-            when = f"at step {self.num_timesteps:,}"
-            check_rows(rewards, "reward", when)
-            check_rows(new_obs, "observation", when)
-            check_rows(actions, "action", when)
-        dones = seen.get("dones")
-        if dones is None or True not in (ended := dones.tolist()):
+        share = min(self.num_timesteps / max(self.model._total_timesteps, 1), 1.0)
+        if self.bar.disable and time.monotonic() - self.told_at <= SECONDS_BETWEEN_LINES:
             return True
-        # Observations before resets, and the returns in Monitor's records.
-        for i, info in enumerate(seen["infos"]):
-            if not ended[i]:
-                continue
-            last, total = info.get("terminal_observation"), info.get("episode", _NO_EPISODE)["r"]
-            if not (is_finite(last) and isfinite(total)):
-                where = f"of an episode of environment {i} at step {self.num_timesteps:,}"
-                check_numbers(last, "last observation", where)
-                check_numbers(total, "return", where)
+        figures = f"{self.num_timesteps:,} steps"
+        if episodes := self.model.ep_info_buffer:
+            mean = np.mean([episode["r"] for episode in episodes])
+            figures += f"  mean return in {self.where} {mean:.2f}"
+        self.bar.update(self.task, completed=share, description=figures)
+        if self.bar.disable:
+            self.told_at = time.monotonic()
+            self.console.print(f"{share:4.0%}  {figures}", highlight=False)
         return True
+
+    def _on_training_end(self) -> None:
+        self.bar.stop()  # gives the terminal back; may be called repeatedly
 
 
 # --- the pulls of a training on a bandit ----------------------------------------------------------
@@ -296,11 +304,12 @@ class EvaluationCallback(EvalCallback):
     Attributes:
         eval_freq: calls of ``VecEnv.step`` between two evaluations; 0 for none.
         eval_episode_freq: episodes between two evaluations, likewise.
+        best: the best mean return of all evaluations; None before the first.
         taken: the time of all evaluations.
         n_episodes: of each evaluation; 0 if it is exact.
     """
 
-    excluded_from_states = ("eval_env", "taken")
+    excluded_from_states = ("eval_env", "taken", "_written_at")
 
     def __init__(
         self,
@@ -313,10 +322,11 @@ class EvaluationCallback(EvalCallback):
     ) -> None:
         super().__init__(eval_env, eval_freq=frequencies[0], verbose=0)
         self.eval_episode_freq = frequencies[1]
+        self.is_asked_for = max(frequencies) > 0
         self.run, self.evaluator = run, evaluator
         self.value_maps, self.critics = value_maps, critics
-        self.episodes_seen = 0
-        self.best_timesteps = self.best_episodes = 0
+        self.best: float | None = None
+        self.episodes_seen = self.best_timesteps = self.best_episodes = 0
         self.taken = WorkTime()
         self.n_episodes: list[int] = []
         self._written_at = -math.inf
@@ -332,16 +342,6 @@ class EvaluationCallback(EvalCallback):
         """Count skipped calls."""
         self.n_calls += n_calls
         self.episodes_seen += n_episodes
-
-    @property
-    def is_asked_for(self) -> bool:
-        """Whether there are evaluations during training."""
-        return self.eval_freq > 0 or self.eval_episode_freq > 0
-
-    @property
-    def best(self) -> float | None:
-        """The best mean return of all evaluations in training."""
-        return self.best_mean_reward if self.best_timesteps else None
 
     def _init_callback(self) -> None:
         """Skip the library's check that training and evaluation environments have one type."""
@@ -374,7 +374,7 @@ class EvaluationCallback(EvalCallback):
             self.evaluations_successes.append(found.successes.tolist())
         self.n_episodes.append(0 if found.is_exact else len(found.returns))
         # Replacing a file takes longer than an exact evaluation.
-        if not 0 <= time.monotonic() - self._written_at < SECONDS_BETWEEN_WRITES:
+        if time.monotonic() - self._written_at >= SECONDS_BETWEEN_WRITES:
             self.write()
         if self.value_maps is not None:
             self.value_maps.record(self.model, self.num_timesteps)
@@ -382,9 +382,9 @@ class EvaluationCallback(EvalCallback):
             self.critics.judge(self.num_timesteps, self.episodes_seen)
         self._log(found)
         if found.mean_return > self.best_mean_reward:
-            self.best_mean_reward = found.mean_return
+            self.best = self.best_mean_reward = found.mean_return
             self.best_timesteps, self.best_episodes = self.num_timesteps, self.n_episodes[-1]
-            self.run.save(self.model, self.run.best_model_path)
+            save_agent(self.model, self.run.best_model_path)
         return self._on_event() if self.callback is not None else True
 
     def take_statistics(self) -> None:
@@ -396,13 +396,19 @@ class EvaluationCallback(EvalCallback):
         """Write ``evaluations.npz``."""
         if not self.evaluations_timesteps:
             return
+
+        def table(rows: list[list[Any]]) -> NDArray[Any]:
+            # Shorter rows are repeated; rl_zoo3's plots need at least two columns.
+            width = max(math.lcm(*map(len, rows)), 2)
+            return np.array([row * (width // len(row)) for row in rows])
+
         arrays: dict[str, Any] = {
             "timesteps": self.evaluations_timesteps,
-            "results": _table(self.evaluations_results),
-            "ep_lengths": _table(self.evaluations_length),
+            "results": table(self.evaluations_results),
+            "ep_lengths": table(self.evaluations_length),
         }
         if self.evaluations_successes:
-            arrays["successes"] = _table(self.evaluations_successes)
+            arrays["successes"] = table(self.evaluations_successes)
         if len(set(self.n_episodes)) > 1:
             arrays["n_episodes"] = self.n_episodes
         with replacing(self.run.path / "evaluations.npz") as beside:
@@ -420,12 +426,6 @@ class EvaluationCallback(EvalCallback):
             record("eval/score", found.yardstick.score(found.mean_return))
         record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
-
-
-def _table(rows: list[list[Any]]) -> NDArray[Any]:
-    """Rows as one array, shorter rows repeated; rl_zoo3's plots need at least two columns."""
-    width = max(math.lcm(*map(len, rows)), 2)
-    return np.array([row * (width // len(row)) for row in rows])
 
 
 def evaluation_frequencies(

@@ -1,7 +1,7 @@
-"""Classes, schedules and other objects that plain values in hyperparameters stand for.
+"""Names that become objects: classes, schedules and noise in hyperparameters, and typed modules.
 
 A name in a file can choose a class of a fixed kind from a fixed set of packages; it cannot import
-or call anything else.
+or call anything else. Modules of the user are imported because their names were typed.
 """
 
 from __future__ import annotations
@@ -9,11 +9,13 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+import sys
+import traceback
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from rl_yardstick.pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
-from rl_yardstick.pipeline.modules import module_name
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
 # Names in files are looked up in these packages, and in modules that the user typed. Importing
@@ -29,6 +31,78 @@ _CLASSES = {
     "HerReplayBuffer": "stable_baselines3.her.her_replay_buffer.HerReplayBuffer",
 }
 _PLACES = re.compile(r"(path|dir|folder|file|filename|log|prefix)$")
+_DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")
+
+
+# --- modules of the user --------------------------------------------------------------------------
+
+
+def import_modules(typed: Iterable[str]) -> None:
+    """Import modules by name or by file; the current folder comes first, as with ``python -m``.
+
+    Without any name the current folder is not searched: it may be a stranger's.
+
+    Raises:
+        UserError: if there is no such module, or importing it fails.
+    """
+    names = list(typed)
+    if names and str(Path.cwd()) not in sys.path[:1]:
+        sys.path.insert(0, str(Path.cwd()))
+    for name in names:
+        try:
+            if name.endswith(".py") or "/" in name:
+                _import_file(Path(name).expanduser())
+            else:
+                importlib.import_module(name)
+        except UserError:
+            raise
+        except ModuleNotFoundError as error:
+            raise UserError(f"--gym-packages {name}: no module named {error.name}") from error
+        except (Exception, SystemExit) as error:  # an import may raise anything
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{last.filename}:{last.lineno}"
+            raise UserError(f"--gym-packages {name}: {place}: {one_line(error)}") from error
+
+
+def _import_file(path: Path) -> None:
+    file = path / "__init__.py" if path.is_dir() else path
+    if not file.is_file():
+        raise UserError(f"--gym-packages {path}: no such file")
+    module = file.parent if file.name == "__init__.py" else file.with_suffix("")
+    loaded = sys.modules.get(module.name)
+    if loaded is None:
+        sys.path.insert(0, str(module.parent.resolve()))  # what lies beside it can be imported too
+        importlib.import_module(module.name)
+    elif Path(getattr(loaded, "__file__", None) or "").resolve() != file.resolve():
+        fault = f"another module is named {module.name}; rename it"
+        raise UserError(f"--gym-packages {path}: {fault}")
+
+
+def module_name(typed: str) -> str:
+    """The name under which `import_modules` has imported what was typed."""
+    return Path(typed).stem if typed.endswith(".py") or "/" in typed else typed
+
+
+def split_id(env_id: str) -> tuple[str, str]:
+    """The module and the id in ``module:Env-v0``, Gymnasium's form; an empty module without it."""
+    module, _, name = env_id.rpartition(":")
+    return module, name
+
+
+def check_typed(recorded: Iterable[str], typed: Iterable[str], where: str) -> None:
+    """Refuse to import what only a file names.
+
+    Raises:
+        UserError: if a module is missing among those that the user typed.
+    """
+    known = {module_name(name) for name in typed}
+    missing = [name for name in recorded if module_name(name) not in known]
+    if missing:
+        what = f"was made with modules of yours: add --gym-packages {' '.join(missing)}"
+        raise UserError(f"{where} {what}")
+
+
+# --- classes, and what they are built from --------------------------------------------------------
 
 
 def find_class(name: str, bases: tuple[type, ...], where: str, typed: list[str]) -> type:
@@ -108,13 +182,50 @@ def build_value(value: Any, where: str, typed: list[str]) -> Any:
         return {key: build_value(item, f"{where}: {key}", typed) for key, item in value.items()}
     if isinstance(value, list):
         return [build_value(item, where, typed) for item in value]
-    is_name = isinstance(value, str) and re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+", value)
-    if is_name or value in _CLASSES.values() or (isinstance(value, str) and value in _CLASSES):
-        from stable_baselines3.common.buffers import BaseBuffer
-        from torch import nn, optim
+    if not isinstance(value, str) or (value not in _CLASSES and not _DOTTED.fullmatch(value)):
+        return value
+    from stable_baselines3.common.buffers import BaseBuffer
+    from torch import nn, optim
 
-        return find_class(str(value), (nn.Module, optim.Optimizer, BaseBuffer), where, typed)
-    return value
+    return find_class(value, (nn.Module, optim.Optimizer, BaseBuffer), where, typed)
+
+
+# --- the arguments of an agent --------------------------------------------------------------------
+
+
+def constructor_arguments(spec: TrainSpec, algorithm: Any, is_dict: bool) -> dict[str, Any]:
+    """The arguments of an agent's constructor, with objects in place of texts that name them.
+
+    Args:
+        spec: the training.
+        algorithm: the agent's class.
+        is_dict: whether observations are dictionaries, which decides the default policy.
+    """
+    from stable_baselines3.common.policies import BasePolicy
+
+    from rl_yardstick.agents.common.model_files import JsonAlgorithm
+    from rl_yardstick.pipeline.arguments import arguments_of
+
+    for_library, kinds = not issubclass(algorithm, JsonAlgorithm), arguments_of(spec.algo)
+    policies = list(getattr(algorithm, "policy_aliases", {}))
+    found: dict[str, Any] = {}
+    for key, value in spec.algorithm.items():
+        where, text = f"{spec.algo}: {key}", str(value)
+        if text.startswith(("lin_", "exp_")) and "str" not in kinds[key]:
+            found[key] = schedule(text, for_library)
+        elif key == "train_freq" and isinstance(value, list):
+            found[key] = tuple(value)
+        elif key == "policy" and "." in text:
+            found[key] = find_class(text, (BasePolicy,), where, spec.gym_packages)
+        elif key == "policy" and policies and value not in policies:
+            raise unknown(f"{spec.algo}: unknown policy", text, policies)
+        else:
+            found[key] = build_value(value, where, spec.gym_packages)
+    if "policy" in kinds and "policy" not in found:
+        prefix = "MultiInput" if is_dict else "Mlp"
+        fitting = [name for name in policies if name.startswith(prefix)]
+        found["policy"] = [*fitting, *policies, f"{prefix}Policy"][0]
+    return found
 
 
 def schedule(text: str, for_library: bool) -> Any:
@@ -133,58 +244,9 @@ def schedule(text: str, for_library: bool) -> Any:
             return LinearSchedule(start, end, 1.0)
         found = ExponentialSchedule(start, end)
     except ValueError as error:
-        reason = one_line(error)
-        raise UserError(f"{text} is no schedule such as lin_0.001 or exp_0.5_0.01: {reason}") from (
-            error
-        )
+        fault = f"{text} is no schedule such as lin_0.001 or exp_0.5_0.01: {one_line(error)}"
+        raise UserError(fault) from error
     return library_schedule(found) if for_library else found
-
-
-def constructor_arguments(spec: TrainSpec, algorithm: type, is_dict: bool) -> dict[str, Any]:
-    """The arguments of an agent's constructor, with objects in place of texts that name them.
-
-    Args:
-        spec: the training.
-        algorithm: the agent's class.
-        is_dict: whether observations are dictionaries, which decides the default policy.
-    """
-    from rl_yardstick.agents.common.model_files import JsonAlgorithm
-    from rl_yardstick.pipeline.arguments import arguments_of
-
-    for_library, kinds = not issubclass(algorithm, JsonAlgorithm), arguments_of(spec.algo)
-    found: dict[str, Any] = {}
-    for key, value in spec.algorithm.items():
-        where = f"{spec.algo}: {key}"
-        if (
-            isinstance(value, str)
-            and value.startswith(("lin_", "exp_"))
-            and "str" not in kinds[key]
-        ):
-            found[key] = schedule(value, for_library)
-        elif key == "train_freq" and isinstance(value, list):
-            found[key] = tuple(value)
-        elif key == "policy":
-            found[key] = _policy(spec, algorithm, value)
-        else:
-            found[key] = build_value(value, where, spec.gym_packages)
-    if "policy" in kinds and "policy" not in found:
-        prefix = "MultiInput" if is_dict else "Mlp"
-        known: list[str] = [*getattr(algorithm, "policy_aliases", {})]
-        fitting = (name for name in known if name.startswith(prefix))
-        found["policy"] = next(fitting, next(iter(known), f"{prefix}Policy"))
-    return found
-
-
-def _policy(spec: TrainSpec, algorithm: Any, name: Any) -> Any:
-    """The policy's name, or its class."""
-    from stable_baselines3.common.policies import BasePolicy
-
-    where, known = f"{spec.algo}: policy", algorithm.policy_aliases
-    if "." in str(name):
-        return find_class(str(name), (BasePolicy,), where, spec.gym_packages)
-    if known and name not in known:
-        raise unknown(f"{spec.algo}: unknown policy", str(name), known)
-    return name
 
 
 def action_noise(spec: TrainSpec, actions: Any) -> dict[str, Any]:

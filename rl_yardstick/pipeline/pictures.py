@@ -16,7 +16,7 @@ def draw(folder: Path, parts: Any) -> None:
 
     Args:
         folder: the run folder.
-        parts: the `Parts` of the training, at its end.
+        parts: the `Training`, at its end.
     """
     spec, evaluation, agent = parts.spec, parts.evaluation, parts.agent
     if not spec.pictures:

@@ -10,18 +10,18 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.pipeline.arguments import arguments_of, check_arguments, check_keywords
+from rl_yardstick.pipeline.arguments import AUTO, WRAPPERS, arguments_of, check_arguments
 from rl_yardstick.pipeline.errors import UserError, did_you_mean, shown, unknown
 from rl_yardstick.pipeline.files import read_text
-from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec, validated
 
 HYPERPARAMS = Path(__file__).resolve().parents[1] / "hyperparams"
 TUNED_ON = "tuned_on"
@@ -45,7 +45,10 @@ _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Plain values only; the same key twice is a mistake."""
+    """Plain values, and what rl_zoo3 writes into run folders: ordered mappings and tuples.
+
+    The same key twice is a mistake.
+    """
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys = [key.value for key, _ in node.value if key.value != "<<"]  # before they are merged
@@ -55,6 +58,19 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
             line = node.start_mark.line + 1
             raise yaml.YAMLError(f"line {line}: the key {shown(twice)} is there twice")
         return found
+
+    def construct_pairs_of_python(self, node: Any) -> dict[Any, Any]:
+        (pairs,) = self.construct_sequence(node, deep=True)
+        return dict(pairs)
+
+    def construct_tuple_of_python(self, node: Any) -> Any:
+        return self.construct_sequence(node, deep=True)
+
+
+_PYTHON = "tag:yaml.org,2002:python"
+_ORDERED = f"{_PYTHON}/object/apply:collections.OrderedDict"
+_Loader.add_constructor(_ORDERED, _Loader.construct_pairs_of_python)
+_Loader.add_constructor(f"{_PYTHON}/tuple", _Loader.construct_tuple_of_python)
 
 
 def read_yaml(path: Path) -> Any:
@@ -70,18 +86,28 @@ def parse_yaml(text: str, where: str) -> Any:
     """The plain values that a text in YAML spells."""
     try:
         return yaml.load(text, Loader=_Loader)  # noqa: S506  # a safe loader
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{where} is no valid YAML: {' '.join(str(error).split())}") from error
+
+
+def _check_names(found: Any, words: str) -> dict[str, Any]:
+    """The value, which must be a mapping of names."""
+    if not (isinstance(found, dict) and all(isinstance(key, str) for key in found)):
+        raise UserError(words)
+    return found
+
+
+def read_saved(path: Path) -> dict[str, Any]:
+    """The settings in a run folder of this project or of rl_zoo3."""
+    found = _check_names(read_yaml(path), f"{path} must map names to values")
+    return {key: _read_dict(value) for key, value in found.items()}
 
 
 def read_entries(path: Path) -> dict[str, Any]:
     """All entries of a file of hyperparameters, with ``tuned_on``."""
     if path.suffix == ".py":
         raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
-    entries = read_yaml(path)
-    if not (isinstance(entries, dict) and all(isinstance(key, str) for key in entries)):
-        raise UserError(f"{path} must map environment ids to hyperparameters")
-    return entries
+    return _check_names(read_yaml(path), f"{path} must map environment ids to hyperparameters")
 
 
 def read_entry(
@@ -94,43 +120,32 @@ def read_entry(
     to another id, that id's entry is used: for CliffWalking-v1 with ``is_slippery: True``, the
     entry of CliffWalkingSlippery-v1.
     """
-    if path is None and not (HYPERPARAMS / f"{algo}.yml").is_file():
+    from gymnasium import registry
+
+    shipped = HYPERPARAMS / f"{algo}.yml"
+    if path is None and not shipped.is_file():
         return {}
-    path = path or HYPERPARAMS / f"{algo}.yml"
-    entries = read_entries(path)
-    key = _same_environment(entries, env_id, env_kwargs) or _key(entries, env_id)
+    path = path or shipped
+    entries, own = read_entries(path), registry.get(env_id)
+    key = _key(entries, env_id)
+    if env_kwargs and own is not None:
+        meant = own.entry_point, {**own.kwargs, **env_kwargs}, own.max_episode_steps
+        named = [registry[name] for name in entries if name in registry]
+        same = [s.id for s in named if (s.entry_point, s.kwargs, s.max_episode_steps) == meant]
+        key = same[0] if same else key
     if key is None:
         hint = did_you_mean(env_id, entries, n=3)
         raise UserError(
             f"{path}: no entry for {shown(env_id)}{' (' + hint + ')' if hint else ''}; "
             "give hyperparameters with -params, or another file with --conf-file"
         )
-    entry = entries[key]
-    if not (isinstance(entry, dict) and all(isinstance(name, str) for name in entry)):
-        raise UserError(f"{path}: the entry {key} must map names to values")
+    entry = _check_names(entries[key], f"{path}: the entry {key} must map names to values")
     return {name: _read_dict(value) for name, value in entry.items()}
 
 
 def _key(entries: Mapping[str, Any], env_id: str) -> str | None:
     names = (env_id, "atari" if _ATARI_ID.fullmatch(env_id) else "default", "default")
     return next((name for name in names if name in entries), None)
-
-
-def _same_environment(
-    entries: Mapping[str, Any], env_id: str, env_kwargs: Mapping[str, Any] | None
-) -> str | None:
-    """The id of an entry that is registered as this environment with the same arguments."""
-    from gymnasium import registry
-
-    own = registry.get(env_id)
-    if not env_kwargs or own is None:
-        return None
-    meant = own.entry_point, {**own.kwargs, **env_kwargs}, own.max_episode_steps
-    named = (registry[name] for name in entries if name in registry)
-    return next(
-        (one.id for one in named if (one.entry_point, one.kwargs, one.max_episode_steps) == meant),
-        None,
-    )
 
 
 def seeds_tuned_on(algo: str, env_id: str, path: Path | None = None) -> tuple[range, ...] | None:
@@ -141,17 +156,13 @@ def seeds_tuned_on(algo: str, env_id: str, path: Path | None = None) -> tuple[ra
     entries = read_entries(path or shipped)
     if TUNED_ON not in entries:
         return () if path is None else None
-    where = f"{path or shipped}: {TUNED_ON}"
-    seeds = entries[TUNED_ON]
     try:
-        given = seeds.get(_key(entries, env_id) or "", [])
-        ranges = [
-            (one["first"], one["count"]) for one in (given if type(given) is list else [given])
-        ]
-        return tuple(range(first, first + count) for first, count in ranges)
+        given = entries[TUNED_ON].get(_key(entries, env_id) or "", [])
+        ranges = given if type(given) is list else [given]
+        return tuple(range(one["first"], one["first"] + one["count"]) for one in ranges)
     except (AttributeError, LookupError, TypeError) as error:
-        form = "entries to seeds such as {first: 0, count: 10}"
-        raise UserError(f"{where} must map {form}") from error
+        form = "must map entries to seeds such as {first: 0, count: 10}"
+        raise UserError(f"{path or shipped}: {TUNED_ON} {form}") from error
 
 
 def entry_names(algo: str) -> list[str]:
@@ -169,11 +180,10 @@ def entry_names(algo: str) -> list[str]:
 def parse_assignments(texts: Iterable[str], flag: str) -> dict[str, Any]:
     """The values of ``name:literal`` words, such as ``gamma:0.9 policy_kwargs:dict(...)``."""
     found: dict[str, Any] = {}
-    words = list(texts)
-    for place, text in enumerate(words):
+    for text in texts:
         name, colon, value = text.partition(":")
         if not (colon and name.isidentifier() and value.strip()):
-            hint = _meant(words[place:])
+            hint = f": did you mean {text.replace('=', ':', 1)}?" if "=" in text else ""
             raise UserError(f"{flag}: {shown(text)} is not of the form name:value{hint}")
         if name in found:
             raise UserError(f"{flag}: {shown(name)} is given twice")
@@ -181,27 +191,13 @@ def parse_assignments(texts: Iterable[str], flag: str) -> dict[str, Any]:
     return found
 
 
-def _meant(words: Sequence[str]) -> str:
-    """A hint for ``name=value``, ``name value``, ``name = value`` and ``name: value``."""
-    name, *others = [*words[0].split("=", 1), *words[1:3]]
-    name = name.rstrip(":")
-    value = next(filter(None, (other.lstrip("=") for other in others)), "")
-    is_name = name.isidentifier() and value and ":" not in value
-    return f": did you mean {name}:{value}?" if is_name else ""
-
-
 def literal(text: str) -> Any:
     """The literal of Python or YAML that a text spells, also as ``dict(...)``; or else the text."""
-    try:
+    with suppress(SyntaxError, ValueError, RecursionError, MemoryError):
         return _literal(ast.parse(text.strip(), mode="eval").body)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        pass
-    # YAML has more literals, such as {a: 1}.
-    if text.strip().startswith(("[", "{")):
-        try:
+    if text.strip().startswith(("[", "{")):  # YAML has more literals, such as {a: 1}
+        with suppress(UserError):
             return parse_yaml(text, text)
-        except UserError:
-            pass
     return text
 
 
@@ -255,62 +251,24 @@ def training_follows(
 def check_agent(algo: str) -> None:
     """Raise UserError if there is no such agent, or a package that it needs is missing."""
     entry = ALGORITHMS.get(algo)
-    if entry is None and algo.lower() == "her":
-        raise UserError(
-            "hindsight experience replay is no agent but a replay buffer, for environments with "
-            "goals: --algo sac -params replay_buffer_class:HerReplayBuffer policy:MultiInputPolicy"
-        )
     if entry is None:
         raise unknown("unknown agent", algo, ALGORITHMS)
     if not entry.is_installed:
-        raise UserError(
-            f"{algo} needs {entry.package}, which is not installed: {entry.install_command}"
-        )
+        fault = f"{entry.package}, which is not installed: {entry.install_command}"
+        raise UserError(f"{algo} needs {fault}")
 
 
-def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -> TrainSpec:
-    """The spec of an entry, with numbers in place of ``auto``.
-
-    Args:
-        algo: the agent.
-        env_id: the environment, which is registered.
-        entry: its hyperparameters.
-        fields: other fields of `TrainSpec`.
-
-    Raises:
-        UserError: for an agent, a key or a value that does not exist or does not fit.
-    """
-    from rl_yardstick.pipeline.auto import resolved
-
-    check_agent(algo)
-    entry = {key: _read_dict(value) for key, value in entry.items() if value is not None}
-    if all(entry.get(budget) is not None for budget in BUDGETS):
-        raise UserError("give n_timesteps or n_episodes, not both")
-    # Without noise_type, noise_std is an argument of some agents.
-    keys = [key for key in SPECIAL if key != "noise_std" or "noise_type" in entry]
-    special = {key: entry[key] for key in keys if key in entry}
-    rest = {key: value for key, value in entry.items() if key not in keys}
-    for key in rest:
-        if key in _SET_ELSEWHERE:
-            raise UserError(f"{key} is set by {_SET_ELSEWHERE[key]}, not here")
-        if key not in arguments_of(algo):
-            raise unknown(f"{algo} has no hyperparameter", key, [*arguments_of(algo), *SPECIAL])
+def special_settings(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a spec that the special keys of an entry give."""
+    special = {key: entry[key] for key in SPECIAL if entry.get(key) is not None}
     for key in COMPONENTS:
-        special[key] = components(special.get(key), key)
+        special[key] = _components(special.get(key), key)
     if isinstance(special.get("normalize"), bool):
         special["normalize"] = {} if special["normalize"] else None
-    for key in ("normalize", "monitor_kwargs"):
-        if special.get(key) is not None:
-            special[key] = check_keywords(key, special[key])
-    algorithm = check_arguments(algo, rest)
-    if special.get("normalize") is not None and isinstance(algorithm.get("gamma"), float):
-        # As in rl_zoo3, rewards are normalised with the agent's discount.
-        special["normalize"].setdefault("gamma", algorithm["gamma"])
-    found = {"algo": algo, "env_id": env_id, "algorithm": algorithm, **special, **fields}
-    return resolved(found)
+    return special
 
 
-def components(value: Any, where: str) -> list[dict[str, Any]]:
+def _components(value: Any, where: str) -> list[dict[str, Any]]:
     """Wrappers or callbacks in rl_zoo3's forms: a name, ``{name: kwargs}``, or a list of these."""
     found: list[dict[str, Any]] = []
     for item in value if isinstance(value, list) else [] if value is None else [value]:
@@ -322,6 +280,57 @@ def components(value: Any, where: str) -> list[dict[str, Any]]:
         else:
             raise UserError(f"{where}: {shown(item)} is no class name with arguments")
     return found
+
+
+def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -> TrainSpec:
+    """The spec of an entry, with numbers in place of ``auto``; its ``origins`` tell how.
+
+    Args:
+        algo: the agent.
+        env_id: the environment, which is registered.
+        entry: its hyperparameters.
+        fields: other fields of `TrainSpec`.
+
+    Raises:
+        UserError: for an agent, a key or a value that does not exist or does not fit.
+    """
+    check_agent(algo)
+    entry = {key: _read_dict(value) for key, value in entry.items() if value is not None}
+    if all(budget in entry for budget in BUDGETS):
+        raise UserError("give n_timesteps or n_episodes, not both")
+    special = special_settings(entry)
+    if "noise_type" not in entry:  # then noise_std is an argument of some agents
+        special.pop("noise_std", None)
+    rest = {key: value for key, value in entry.items() if key not in special}
+    for key in rest:
+        if key in _SET_ELSEWHERE:
+            raise UserError(f"{key} is set by {_SET_ELSEWHERE[key]}, not here")
+        if key not in arguments_of(algo):
+            raise unknown(f"{algo} has no hyperparameter", key, [*arguments_of(algo), *SPECIAL])
+    for key in WRAPPERS:
+        if special.get(key) is not None:
+            special[key] = check_arguments(key, special[key], f"{key}: ")
+    algorithm = check_arguments(algo, rest)
+    if special.get("normalize") is not None and isinstance(algorithm.get("gamma"), float):
+        # As in rl_zoo3, rewards are normalised with the agent's discount.
+        special["normalize"].setdefault("gamma", algorithm["gamma"])
+    asked = [key for key in AUTO if algorithm.get(key) == "auto"]
+    steps = str(special.get("n_timesteps", ""))
+    if steps.startswith("auto"):
+        special["n_timesteps"] = None
+        if not _STEPS.fullmatch(steps):
+            form = "auto, or auto_1000 with the steps for each pair of state and action"
+            raise UserError(f"n_timesteps: {steps!r} is not {form}")
+    else:
+        steps = ""
+    plain = {key: value for key, value in algorithm.items() if key not in asked}
+    found = {"algo": algo, "env_id": env_id, "algorithm": plain, **special, **fields}
+    spec = _with_rewards(validated(found))
+    if asked or steps:
+        spec = _with_numbers(spec, asked, steps)
+    if not (spec.n_timesteps or spec.n_episodes):
+        raise UserError("the training has no budget: give -n STEPS or --n-episodes N")
+    return spec
 
 
 # Settings of the task: a run's shipped settings are those for its own task.
@@ -344,28 +353,98 @@ def shipped_hyperparams(spec: TrainSpec) -> dict[str, Any]:
     return {key: value for key, value in entry.items() if not str(value).startswith("auto")}
 
 
-class _SavedLoader(_Loader):
-    """Also reads what rl_zoo3 writes into run folders: ordered mappings and tuples."""
+# --- the values of ``auto``, which follow from the environment's size and rewards ----------------
+#
+# - ``gamma: auto`` is 1 - 1/(2 x time limit of evaluations): a reward one time limit ahead has the
+#   weight 0.6.
+# - ``n_timesteps: auto_K`` is K steps for each pair of state and action, for at least 100 pairs;
+#   ``auto`` is ``auto_2500``.
+# - ``learning_rate: auto`` falls from 0.3 to 10 x pairs / steps, within 0.003 and 0.05.
+# - ``initial_q: auto`` and ``value_bound: auto`` are the highest reward that ends an episode.
+# - In ``train_env_wrapper``, ``scale: auto`` is 1 / the largest absolute reward; ``min_reward:
+#   auto`` is the lowest reward, but at least -1/10 of a positive highest one.
+
+STEPS_PER_PAIR, FEWEST_PAIRS = 2500, 100  # training steps per state and action
+VISITS_AVERAGED = 10  # a step size of 1 / n averages over about the last n visits
+FIRST_STEP_SIZE, LAST_STEP_SIZES = 0.3, (0.003, 0.05)
+_STEPS = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
 
-def _mapping(loader: Any, node: Any) -> dict[str, Any]:
-    ((pairs,),) = [loader.construct_sequence(node, deep=True)]
-    return dict(pairs)
+def _with_numbers(spec: TrainSpec, asked: list[str], steps: str) -> TrainSpec:
+    """Settings of tables, from the evaluation environment."""
+    from gymnasium.spaces import Discrete
+
+    from rl_yardstick.envs.known_models import time_limit, transition_model
+    from rl_yardstick.pipeline.environments import check_fit, make_single_env
+
+    check_fit(spec)
+    where, n_timesteps = f"{spec.algo} on {spec.env_id}", spec.n_timesteps
+    origins, algorithm = dict(spec.origins), dict(spec.algorithm)
+    with closing(make_single_env(spec)) as env:
+        spaces = env.observation_space, env.action_space
+        counts = [int(space.n) for space in spaces if isinstance(space, Discrete)]
+        if len(counts) < 2:
+            raise UserError(f"{where}: auto needs Discrete observations and actions")
+        states, actions = counts
+        if steps:
+            per_pair = int(steps[5:] or STEPS_PER_PAIR)
+            pairs = max(states * actions, FEWEST_PAIRS)
+            least = f", counted as {pairs} pairs" if pairs > states * actions else ""
+            n_timesteps = per_pair * pairs
+            how = f"{per_pair:,} for each pair of {states:,} states and {actions:,} actions{least}"
+            origins["n_timesteps"] = f"auto: {how}"
+        for key in asked:
+            if key == "gamma":
+                if (limit := time_limit(env)) is None:
+                    raise UserError(f"{where}: gamma: auto needs an environment with a time limit")
+                algorithm[key] = round(1 - 1 / (2 * limit), 7)
+                origins[key] = f"auto: 1 - 1/(2 x time limit of {limit:,})"
+            elif key == "learning_rate":
+                low, high = LAST_STEP_SIZES
+                last, origins[key] = high, "auto"
+                if n_timesteps is not None:
+                    last = min(max(VISITS_AVERAGED * states * actions / n_timesteps, low), high)
+                    rule = f"{VISITS_AVERAGED} x states x actions / steps"
+                    origins[key] = f"auto: ends at {rule}, within {low} and {high}"
+                algorithm[key] = f"exp_{FIRST_STEP_SIZE:g}_{last:.2g}"
+            else:
+                model = transition_model(env)
+                if model is None or not (ends := model.terminated & (model.prob > 0)).any():
+                    needed = "a known model whose episodes can end"
+                    raise UserError(f"{where}: {key}: auto needs {needed}")
+                algorithm[key] = float(model.reward[ends].max())
+                origins[key] = "auto: the highest reward that ends an episode"
+    return spec.changed(n_timesteps=n_timesteps, algorithm=algorithm, origins=origins)
 
 
-_PYTHON = "tag:yaml.org,2002:python"
-_SavedLoader.add_constructor(f"{_PYTHON}/object/apply:collections.OrderedDict", _mapping)
-_SavedLoader.add_constructor(
-    f"{_PYTHON}/tuple", lambda loader, node: loader.construct_sequence(node, deep=True)
-)
+def _with_rewards(spec: TrainSpec) -> TrainSpec:
+    """The arguments of training wrappers, from the rewards that reach them."""
+    from rl_yardstick.envs.known_models import transition_model
+    from rl_yardstick.pipeline.environments import make_single_env
 
-
-def read_saved(path: Path) -> dict[str, Any]:
-    """The settings in a run folder of this project or of rl_zoo3."""
-    try:
-        found = yaml.load(read_text(path), Loader=_SavedLoader)  # noqa: S506  # a safe loader
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise UserError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from error
-    if not (isinstance(found, dict) and all(isinstance(key, str) for key in found)):
-        raise UserError(f"{path} must map names to values")
-    return {key: _read_dict(value) for key, value in found.items()}
+    wrappers, told = list(spec.train_env_wrapper), []
+    for place, wrapper in enumerate(wrappers):
+        kwargs = dict(wrapper.kwargs)
+        for key in [key for key in ("scale", "min_reward") if kwargs.get(key) == "auto"]:
+            inner = spec.changed(train_env_wrapper=wrappers[:place])
+            with closing(make_single_env(inner, training=True)) as env:
+                model = transition_model(env)
+            if model is None:
+                raise UserError(f"{spec.env_id}: {key}: auto needs an environment with a model")
+            rewards = model.reward[model.prob > 0]
+            low, high = float(rewards.min()), float(rewards.max())
+            largest = max(-low, high)
+            if key == "scale":
+                value, how = 1 / largest if largest else 1.0, f"1 / the largest reward, {largest:g}"
+            elif high <= 0 or -high / 10 < low:
+                value, how = low, f"{low:g}, the lowest reward"
+            else:  # large costs would teach a network to stand still
+                value = -high / 10
+                how = f"{value:g}, a tenth of the highest reward below zero"
+            kwargs[key] = value
+            told.append(f"{key} auto: {how}")
+        wrappers[place] = wrapper.model_copy(update={"kwargs": kwargs})
+    if not told:
+        return spec
+    origins = {**spec.origins, "train_env_wrapper": "; ".join(told)}
+    return spec.changed(train_env_wrapper=wrappers, origins=origins)

@@ -53,7 +53,7 @@ def test_an_outcome_tells_what_the_run_folder_has():
     assert figures["final"]["gap"] == pytest.approx(
         figures["final"]["optimum"] - figures["final"]["mean_return"]
     )
-    assert (outcome.n_timesteps, outcome.engine, outcome.pulls) == (2000, "compiled", None)
+    assert (outcome.n_timesteps, outcome.engine, outcome.pulled) == (2000, "compiled", None)
     assert outcome.taken.cpu_seconds > 0
     assert record["versions"]["python"].startswith("3.")
 
@@ -70,9 +70,9 @@ def test_a_budget_of_episodes_ends_after_so_many():
 def test_a_bandits_pulls_are_summed_up():
     run, outcome = trained("ucb", "BernoulliBandit-v0", n_timesteps=300)
     pulls = np.load(run.path / "pulls.npz")
-    assert outcome.pulls.n_pulls == 300 == pulls["regrets"].size
-    assert outcome.pulls.regret == pytest.approx(float(pulls["regrets"].sum()))
-    assert run.recorded()["regret"] == outcome.pulls.regret
+    assert outcome.pulled.n_pulls == 300 == pulls["regrets"].size
+    assert outcome.pulled.regret == pytest.approx(float(pulls["regrets"].sum()))
+    assert run.recorded()["regret"] == outcome.pulled.regret
     assert outcome.final is None or outcome.final.mean_return is not None
 
 
