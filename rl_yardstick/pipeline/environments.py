@@ -187,8 +187,8 @@ def make_evaluation_env(
 ) -> Any:
     """Make the evaluation VecEnv.
 
-    ``wrap_innermost`` is put around each environment, inside all other wrappers; Monitors write into
-    ``monitor_folder``; ``extra`` are further arguments of the environments.
+    ``wrap_innermost`` is put around each environment, inside all other wrappers; Monitors write
+    into ``monitor_folder``; ``extra`` are further arguments of the environments.
     """
     monitor = spec.monitor_kwargs
     return _make_vec_env(spec, False, n_envs, monitor_folder, monitor, wrap_innermost, **extra)

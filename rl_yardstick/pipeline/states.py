@@ -84,7 +84,7 @@ def load_state(path: Path, roots: dict[str, Any]) -> None:
     content = read_bytes(path, MAX_STATE)
     if not hmac.compare_digest(content[:32], hmac.digest(_key(), content[32:], "sha256")):
         raise UserError(f"{path} is not signed with your key: a state of others is not loaded")
-    unpickler: Any = pickle.Unpickler(io.BytesIO(content[32:]))
+    unpickler: Any = pickle.Unpickler(io.BytesIO(content[32:]))  # noqa: S301  # signed
     unpickler.persistent_load = roots.__getitem__
     attributes, positions, (python, numpy, torch) = unpickler.load()
     for name, saved in attributes.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -73,26 +74,32 @@ def train(
     if spec.n_threads > 0:
         th.set_num_threads(spec.n_threads)
     spec = spec if spec.trained_agent is None else begun_with(spec)
-    training = Training(spec, run, resumes and run.state_path.exists())
+    resumes = resumes and run.state_path.exists()
+    agent = make_agent(spec, run.path, resumes)
     try:
-        tell(training)
-        training.learn()
-        training.save()
-        training.judge_the_end()
-        draw(run.path, training)
+        training = Training(spec, run, agent, resumes)
+        with closing(training.judge.env):
+            tell(training)
+            training.learn()
+            training.save()
+            training.judge_the_end()
+            draw(run.path, training)
     except Stopped as stopped:
         if run.has_begun:
             training.save()
             training.evaluation.write()
-            steps = training.agent.num_timesteps
-            run.record(spec, INTERRUPTED, stopped_by=stopped.number, n_timesteps=steps)
+            figures = {"stopped_by": stopped.number, "n_timesteps": agent.num_timesteps}
+            run.record(spec, INTERRUPTED, **figures)
         raise
     except BaseException as error:
         if run.has_begun or not run.is_new:
             run.record(spec, FAILED, reason=one_line(error))
         raise
     finally:
-        training.close()
+        if agent.env is not None:
+            agent.env.close()
+        if hasattr(agent, "_logger"):
+            agent.logger.close()
     run.record(spec, FINISHED, **training.figures())
     run.state_path.unlink(missing_ok=True)
     return training
@@ -101,10 +108,7 @@ def train(
 class Training:
     """The agent on its environments, its judge and its callbacks; at the end, the results too.
 
-    Args:
-        spec: the training.
-        run: its folder.
-        resumes: whether the folder's state is put back before the first step.
+    With ``resumes``, the state in the run folder is put back before the first step.
     """
 
     n_timesteps: int  #: environment steps done
@@ -119,9 +123,8 @@ class Training:
     pulled: PullSummary | None = None  #: of a training on a bandit
     advice: Advice | None = None  #: on an agent that has failed
 
-    def __init__(self, spec: TrainSpec, run: Run, resumes: bool) -> None:
-        self.spec, self.run = spec, run
-        self.agent = agent = make_agent(spec, run.path, resumes)
+    def __init__(self, spec: TrainSpec, run: Run, agent: BaseAlgorithm, resumes: bool) -> None:
+        self.spec, self.run, self.agent = spec, run, agent
         is_bandit = agent.env is not None and agent.env.has_attr("n_arms")
         self.judge = Judge(spec, agent, run.console)
         exact = self.judge.exact
@@ -265,14 +268,6 @@ class Training:
             **({} if refusal is None else {"model_refused": refusal}),
         }
 
-    def close(self) -> None:
-        """Close all environments."""
-        for env in (self.agent.env, self.judge.env):
-            if env is not None:
-                env.close()
-        if hasattr(self.agent, "_logger"):
-            self.agent.logger.close()
-
 
 def make_agent(spec: TrainSpec, folder: Path | None, appending: bool = False) -> BaseAlgorithm:
     """The agent on its training environments, whose Monitors write into ``folder``.
@@ -297,7 +292,10 @@ def make_agent(spec: TrainSpec, folder: Path | None, appending: bool = False) ->
         agent: BaseAlgorithm = (
             algorithm(env=env, **arguments) if is_new else load_to_train(spec, env, **arguments)
         )
-    except REFUSALS as error:
+    except (UserError, *REFUSALS) as error:
+        env.close()
+        if isinstance(error, UserError):
+            raise
         raise UserError(f"{spec.algo} on {spec.place}: {one_line(error)}") from error
     if log is None and not spec.library_log:
         agent.set_logger(Logger(folder=None, output_formats=[]))
