@@ -408,23 +408,21 @@ def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
     """What was done: labels and figures."""
     from rl_yardstick.commands.terminal import APART, describe_others, judged
 
-    taken, final = outcome.taken.cpu_seconds, outcome.final
-    speed = outcome.n_timesteps / max(taken, 1e-9)
-    text = (
-        f"{outcome.n_timesteps:,} steps in {taken:.1f} s of processor time ({speed:,.0f} steps/s)"
-    )
+    taken, final = outcome.progress.taken.cpu_seconds, outcome.final
+    speed = outcome.agent.num_timesteps / max(taken, 1e-9)
+    text = f"{outcome.agent.num_timesteps:,} steps in {taken:.1f} s of processor time ({speed:,.0f} steps/s)"
     rows = [("trained", text)]
     if outcome.engine:
         rows.append(("engine", outcome.engine))
     if final is not None and final.others is not None:
         rows += [("beside", line) for line in describe_others(final.others)]
-    if outcome.best is not None:
+    if outcome.evaluation.best is not None:
         yardstick = None if final is None else final.yardstick
-        best = judged(outcome.best, yardstick, outcome.best_episodes)
-        rows.append(("best", APART.join([*best, f"at step {outcome.best_timesteps:,}"])))
+        best = judged(outcome.evaluation.best, yardstick, outcome.evaluation.best_episodes)
+        rows.append(("best", APART.join([*best, f"at step {outcome.evaluation.best_timesteps:,}"])))
     if final is not None:
-        tests = f"{outcome.evaluating.cpu_seconds:.1f} s of processor time"
-        share = outcome.evaluation_steps / max(outcome.n_timesteps, 1)
+        tests = f"{outcome.evaluation.taken.cpu_seconds:.1f} s of processor time"
+        share = outcome.evaluation_steps / max(outcome.agent.num_timesteps, 1)
         played = f"{outcome.evaluation_steps:,} steps beside training ({share:.0%} of it)"
         how = played if outcome.evaluation_steps else "exact, no episodes sampled"
         rows.append(("tests", f"{how}; {tests}"))

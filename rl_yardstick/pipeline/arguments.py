@@ -54,8 +54,7 @@ WRAPPERS = {
 
 @cache
 def _table() -> dict[str, dict[str, list[str]]]:
-    found: dict[str, dict[str, list[str]]] = json.loads(TABLE.read_text(encoding="utf-8"))
-    return found
+    return json.loads(TABLE.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
 
 
 def arguments_of(algo: str) -> dict[str, list[str]]:
@@ -127,10 +126,8 @@ def _kinds(annotation: Any, default: Any = None) -> set[str]:
 def check_arguments(owner: str, values: Any, where: str = "") -> dict[str, Any]:
     """The values of constructor arguments, each of its type (``"1e-4"`` becomes a number).
 
-    ``owner`` is an agent, or a key of `WRAPPERS`; ``where`` begins every message.
-
-    Raises:
-        UserError: for an argument that does not exist, or a value not of its type or range.
+    ``owner`` is an agent, or a key of `WRAPPERS`; ``where`` begins every message. Raises UserError
+    for an argument that does not exist, or a value that is not of its type or range.
     """
     if not isinstance(values, dict):
         raise UserError(f"{owner} must be a mapping, not {shown(values)}")

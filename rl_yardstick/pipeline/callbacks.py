@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 import time
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.utils import ConstantSchedule
@@ -23,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 from rl_yardstick.agents.bandits.runs import PullLog
 from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
 from rl_yardstick.machine_code import WorkTime
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import one_line
 from rl_yardstick.pipeline.evaluation.critics import CriticRecorder
 from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator
@@ -38,14 +37,7 @@ from rl_yardstick.pipeline.states import load_state, roots_of, save_state
 
 
 class Checkpoint(BlockCallback):
-    """Saves ``rl_model_<steps>_steps.zip`` every so many steps or episodes of all environments.
-
-    Args:
-        every_n_steps: steps between two checkpoints; None if episodes are counted.
-        every_n_episodes: episodes between two checkpoints.
-        save_path: the folder.
-        with_replay_buffer: whether the replay buffer and VecNormalize's statistics lie beside.
-    """
+    """Saves ``rl_model_<steps>_steps.zip`` every so many steps or episodes of all environments."""
 
     def __init__(
         self,
@@ -84,27 +76,13 @@ class Checkpoint(BlockCallback):
 
 
 class ExponentialExploration(BaseCallback):
-    """Multiplies DQN's epsilon by a constant factor at each gradient update.
-
-    Args:
-        initial_eps: epsilon before the first update; all arguments are in [0, 1].
-        final_eps: the lower bound of epsilon.
-        decay: the factor.
-    """
+    """Multiplies DQN's epsilon by ``decay`` at each gradient update; all arguments in [0, 1]."""
 
     def __init__(
         self, initial_eps: float = 1.0, final_eps: float = 0.01, decay: float = 0.995
     ) -> None:
         super().__init__()
         self.initial_eps, self.final_eps, self.decay = initial_eps, final_eps, decay
-        for name in ("initial_eps", "final_eps", "decay"):
-            if not 0 <= (value := getattr(self, name)) <= 1:
-                raise ValueError(f"{name} must lie between 0 and 1, not {value}")
-
-    def _init_callback(self) -> None:
-        if not isinstance(self.model, DQN):
-            name = type(self.model).__name__
-            raise UserError(f"ExponentialExploration is for DQN and subclasses, not for {name}")
 
     def _on_rollout_start(self) -> None:
         model: Any = self.model
@@ -126,20 +104,18 @@ class StateCallback(BlockCallback):
     Both happen at a safe moment: after the last update and before the next step. At the first one
     of a resumed run, the saved state is put back.
 
-    Attributes:
-        others: the other callbacks, whose state is saved too.
-        share_of_time: the share of the time that saving may take.
-        shortest_pause: seconds between two states.
+    The state includes that of the ``others``.
     """
 
     takes_blocks = True
-    share_of_time, shortest_pause = 0.02, 1.0
+    share_of_time = 0.02  # that saving may take
+    shortest_pause = 1.0  # seconds between two states
 
     def __init__(
-        self, run: Run, resumes: bool, clock: Clock, judge: Judge, others: list[BaseCallback]
+        self, run: Run, resumes: bool, judge: Judge, others: list[BaseCallback], clock: Any
     ) -> None:
         super().__init__()
-        self.run, self.resumes, self.clock, self.others = run, resumes, clock, others
+        self.run, self.resumes, self.others, self.clock = run, resumes, others, clock
         self.process = {"run": run, "exact": judge.exact, "eval_env": judge.env}
         self.evaluator = {} if judge.exact is not None else {"evaluator": judge.evaluator}
         self.is_possible = True
@@ -164,7 +140,7 @@ class StateCallback(BlockCallback):
 
     def _save(self) -> None:
         begun = time.monotonic()
-        self.clock.stop()
+        self.clock.read_clock()
         try:
             save_state(self.run.state_path, self._roots(), ("logger", *self.process))
         except (TypeError, AttributeError, ValueError, pickle.PicklingError) as error:
@@ -179,46 +155,22 @@ class StateCallback(BlockCallback):
         return True
 
 
-class Clock(BlockCallback):
-    """The time of a training over all its starts, without compiling."""
-
-    excluded_from_states = ("_begun", "_compiling")
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.taken = WorkTime()
-
-    def start(self, time_compiling: Any) -> None:
-        """Begin to count."""
-        self._begun, self._compiling = WorkTime.now() - time_compiling(), time_compiling
-
-    def stop(self) -> None:
-        """Add the time since the start, and go on counting from here."""
-        now = WorkTime.now() - self._compiling()
-        self.taken, self._begun = self.taken + (now - self._begun), now
-
-    def _on_step(self) -> bool:
-        return True
-
-
 UPDATES = 400  # of a training's bar
 SECONDS_BETWEEN_LINES = 10.0
 
 
 class ProgressCallback(BlockCallback):
-    """Tells the steps and the mean return of training's last episodes: a bar, or plain lines.
+    """Tells the steps and the mean return of training's last episodes, and takes the time.
 
-    Args:
-        console: where it is told; the bar is for a terminal.
-        n_timesteps: steps of the training.
-        on_variant: whether training's environment differs from the one of evaluations.
+    Attributes:
+        taken: the time of training over all its starts, without compiling.
     """
 
-    excluded_from_states = ("console", "bar", "task", "told_at")
+    excluded_from_states = ("console", "bar", "task", "told_at", "_begun", "_compiling")
 
     def __init__(self, console: Console, n_timesteps: int, on_variant: bool = False) -> None:
         super().__init__()
-        self.console = console
+        self.console, self.taken = console, WorkTime()
         self.where = "training (on a variant)" if on_variant else "training"
         # A block of compiled training ends where a callback acts: nobody reads a quiet console.
         few = min(max(n_timesteps // UPDATES, 1), 20_000)
@@ -228,6 +180,15 @@ class ProgressCallback(BlockCallback):
         self.bar = Progress(*columns, text, console=console, transient=True, disable=not is_live)
         self.task = self.bar.add_task("", total=1.0)
         self.told_at = time.monotonic()
+
+    def start_clock(self, time_compiling: Callable[[], WorkTime]) -> None:
+        """Begin to count the time."""
+        self._begun, self._compiling = WorkTime.now() - time_compiling(), time_compiling
+
+    def read_clock(self) -> None:
+        """Add the time since the start, and go on counting from here."""
+        now = WorkTime.now() - self._compiling()
+        self.taken, self._begun = self.taken + (now - self._begun), now
 
     def _on_training_start(self) -> None:
         self.told_at = time.monotonic()
@@ -267,19 +228,6 @@ class PullSummary:
     optimal: float | None  #: share of best arms among the last pulls; None as for ``regret``
 
 
-def summarise_pulls(pulls: Mapping[str, NDArray[Any]]) -> PullSummary:
-    """Compute the summary from the arrays of `PullLog.arrays`."""
-    regrets, matched = pulls["regrets"], pulls["matched"]
-    is_known = not bool(np.isnan(regrets).any())
-    return PullSummary(
-        n_pulls=int(regrets.size),
-        n_matched=int(matched.sum()),
-        reward=float(pulls["rewards"][matched].mean(dtype=np.float64)) if matched.any() else None,
-        regret=float(regrets.sum()) if is_known else None,
-        optimal=float(pulls["optimal"][:, -LAST_PULLS:].mean()) if is_known else None,
-    )
-
-
 class PullRecorder(PullLog):
     """Writes ``pulls.npz`` at the end of training, with the contents of `PullLog.arrays`."""
 
@@ -290,6 +238,19 @@ class PullRecorder(PullLog):
     def _on_training_end(self) -> None:
         with replacing(self.folder / PULLS_FILE) as beside:
             np.savez(beside, allow_pickle=False, **self.arrays())
+
+    def summary(self) -> PullSummary:
+        """The summary of all pulls."""
+        pulls = self.arrays()
+        regrets, matched = pulls["regrets"], pulls["matched"]
+        is_known, rewards = not bool(np.isnan(regrets).any()), pulls["rewards"][matched]
+        return PullSummary(
+            n_pulls=int(regrets.size),
+            n_matched=int(matched.sum()),
+            reward=float(rewards.mean(dtype=np.float64)) if rewards.size else None,
+            regret=float(regrets.sum()) if is_known else None,
+            optimal=float(pulls["optimal"][:, -LAST_PULLS:].mean()) if is_known else None,
+        )
 
 
 # --- evaluations during training: when they are due, and what they leave --------------------------
@@ -304,9 +265,6 @@ class EvaluationCallback(EvalCallback):
     Attributes:
         eval_freq: calls of ``VecEnv.step`` between two evaluations; 0 for none.
         eval_episode_freq: episodes between two evaluations, likewise.
-        best: the best mean return of all evaluations; None before the first.
-        taken: the time of all evaluations.
-        n_episodes: of each evaluation; 0 if it is exact.
     """
 
     excluded_from_states = ("eval_env", "taken", "_written_at")
@@ -325,10 +283,10 @@ class EvaluationCallback(EvalCallback):
         self.is_asked_for = max(frequencies) > 0
         self.run, self.evaluator = run, evaluator
         self.value_maps, self.critics = value_maps, critics
-        self.best: float | None = None
+        self.best: float | None = None  # mean return of all evaluations
         self.episodes_seen = self.best_timesteps = self.best_episodes = 0
-        self.taken = WorkTime()
-        self.n_episodes: list[int] = []
+        self.taken = WorkTime()  # by all evaluations
+        self.n_episodes: list[int] = []  # of each evaluation; 0 if it is exact
         self._written_at = -math.inf
 
     def horizon(self) -> Horizon:
@@ -380,7 +338,14 @@ class EvaluationCallback(EvalCallback):
             self.value_maps.record(self.model, self.num_timesteps)
         if self.critics is not None:
             self.critics.judge(self.num_timesteps, self.episodes_seen)
-        self._log(found)
+        scale, mean = found.yardstick, found.mean_return
+        logged = {"mean_reward": mean, "mean_ep_length": float(found.lengths.mean())}
+        logged |= {} if found.success_rate is None else {"success_rate": found.success_rate}
+        logged |= {} if scale is None else {"gap": scale.gap(mean), "score": scale.score(mean)}
+        for name, value in logged.items():
+            self.logger.record(f"eval/{name}", value)
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
         if found.mean_return > self.best_mean_reward:
             self.best = self.best_mean_reward = found.mean_return
             self.best_timesteps, self.best_episodes = self.num_timesteps, self.n_episodes[-1]
@@ -414,18 +379,6 @@ class EvaluationCallback(EvalCallback):
         with replacing(self.run.path / "evaluations.npz") as beside:
             np.savez(beside, **arrays)
         self._written_at = time.monotonic()
-
-    def _log(self, found: Evaluation) -> None:
-        record = self.logger.record
-        record("eval/mean_reward", found.mean_return)
-        record("eval/mean_ep_length", float(found.lengths.mean()))
-        if found.success_rate is not None:
-            record("eval/success_rate", found.success_rate)
-        if found.yardstick is not None:
-            record("eval/gap", found.yardstick.gap(found.mean_return))
-            record("eval/score", found.yardstick.score(found.mean_return))
-        record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(self.num_timesteps)
 
 
 def evaluation_frequencies(

@@ -24,8 +24,8 @@ PACKAGES = (
     *("rl_yardstick", "stable_baselines3", "sb3_contrib", "gymnasium", "torch.nn", "torch.optim"),
     *("rl_zoo3.wrappers", "rl_zoo3.callbacks"),
 )
-_SHORT = {"nn": "torch.nn", "th": "torch", "sb3": "stable_baselines3", "gym": "gymnasium"}
-_SHORT |= {"optim": "torch.optim"}
+_SHORT = {"nn": "torch.nn", "th": "torch", "optim": "torch.optim"}
+_SHORT |= {"sb3": "stable_baselines3", "gym": "gymnasium"}
 _CLASSES = {
     "RMSpropTFLike": "stable_baselines3.common.sb2_compat.rmsprop_tf_like.RMSpropTFLike",
     "HerReplayBuffer": "stable_baselines3.her.her_replay_buffer.HerReplayBuffer",
@@ -41,14 +41,10 @@ def import_modules(typed: Iterable[str]) -> None:
     """Import modules by name or by file; the current folder comes first, as with ``python -m``.
 
     Without any name the current folder is not searched: it may be a stranger's.
-
-    Raises:
-        UserError: if there is no such module, or importing it fails.
     """
-    names = list(typed)
-    if names and str(Path.cwd()) not in sys.path[:1]:
-        sys.path.insert(0, str(Path.cwd()))
-    for name in names:
+    for name in typed:
+        if str(Path.cwd()) not in sys.path[:1]:
+            sys.path.insert(0, str(Path.cwd()))
         try:
             if name.endswith(".py") or "/" in name:
                 _import_file(Path(name).expanduser())
@@ -90,11 +86,7 @@ def split_id(env_id: str) -> tuple[str, str]:
 
 
 def check_typed(recorded: Iterable[str], typed: Iterable[str], where: str) -> None:
-    """Refuse to import what only a file names.
-
-    Raises:
-        UserError: if a module is missing among those that the user typed.
-    """
+    """Raise UserError if a module that a file names is missing among those that were typed."""
     known = {module_name(name) for name in typed}
     missing = [name for name in recorded if module_name(name) not in known]
     if missing:
@@ -106,16 +98,10 @@ def check_typed(recorded: Iterable[str], typed: Iterable[str], where: str) -> No
 
 
 def find_class(name: str, bases: tuple[type, ...], where: str, typed: list[str]) -> type:
-    """The class of a dotted name, if it is a subclass of one of ``bases``.
+    """The class of a dotted name such as ``nn.Tanh``, if it is a subclass of one of ``bases``.
 
-    Args:
-        name: such as ``nn.Tanh``.
-        bases: the kinds that are admitted.
-        where: begins every message.
-        typed: modules of the user, where names are looked up too.
-
-    Raises:
-        UserError: if the name is not admitted, or there is no such class.
+    Names are looked up in the ``typed`` modules of the user too. Raises UserError if the name is
+    not admitted, or there is no such class.
     """
     first, dot, rest = _CLASSES.get(name, name).partition(".")
     module, _, cls = f"{_SHORT.get(first, first)}{dot}{rest}".rpartition(".")
@@ -132,18 +118,12 @@ def find_class(name: str, bases: tuple[type, ...], where: str, typed: list[str])
         return found
     wanted = " or ".join(base.__name__ for base in bases)
     known = [n for n, c in vars(inside).items() if isinstance(c, type) and issubclass(c, bases)]
-    fault = "does not exist" if found is None else f"is no {wanted}"
-    hint = did_you_mean(cls, known)
+    fault, hint = "does not exist" if found is None else f"is no {wanted}", did_you_mean(cls, known)
     raise UserError(f"{where}: {name} {fault}{': ' + hint if hint else ''}")
 
 
 def build(
-    component: Component,
-    base: type,
-    where: str,
-    typed: list[str],
-    folder: Path | None,
-    *inner: Any,
+    component: Component, base: type, where: str, typed: list[str], folder: Path | None, *inner: Any
 ) -> Any:
     """An object of a wrapper or callback, around ``inner``; it may write into ``folder`` alone."""
     from gymnasium.error import Error
@@ -166,14 +146,12 @@ def _inside(name: str, value: Any, folder: Path | None, where: str) -> Any:
     """A path among the arguments, inside the run folder."""
     if not (isinstance(value, str) and _PLACES.search(name)) or folder is None:
         return value
-    if name.endswith("prefix"):
-        if Path(value).name != value:
-            raise UserError(f"{where}: {name} begins the names of files, unlike {shown(value)}")
-        return value
-    path = (folder / value).resolve()
+    path, is_prefix = (folder / value).resolve(), name.endswith("prefix")
+    if is_prefix and Path(value).name != value:
+        raise UserError(f"{where}: {name} begins the names of files, unlike {shown(value)}")
     if not path.is_relative_to(folder.resolve()):
         raise UserError(f"{where}: {name} must lie inside the run folder, unlike {shown(value)}")
-    return str(path)
+    return value if is_prefix else str(path)
 
 
 def build_value(value: Any, where: str, typed: list[str]) -> Any:
@@ -196,10 +174,7 @@ def build_value(value: Any, where: str, typed: list[str]) -> Any:
 def constructor_arguments(spec: TrainSpec, algorithm: Any, is_dict: bool) -> dict[str, Any]:
     """The arguments of an agent's constructor, with objects in place of texts that name them.
 
-    Args:
-        spec: the training.
-        algorithm: the agent's class.
-        is_dict: whether observations are dictionaries, which decides the default policy.
+    ``is_dict``: whether observations are dictionaries, which decides the default policy.
     """
     from stable_baselines3.common.policies import BasePolicy
 

@@ -37,7 +37,6 @@ OTHER_NAMES = {
 _brief = reprlib.Repr()
 _brief.maxstring = _brief.maxother = 60
 
-
 # Control characters except line feeds and tabs; characters that change the writing direction; and
 # surrogates, which no file can contain.
 _OBEYED = re.compile(
@@ -52,6 +51,14 @@ class UserError(Exception):
         super().__init__(visible(" ".join(line.strip() for line in message.splitlines())))
 
 
+class Stopped(Exception):  # noqa: N818  # no error
+    """A signal, whose number it has, has ended the work at a safe moment."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
 def visible(text: str) -> str:
     """The text with control characters escaped, so that a terminal shows them."""
     return _OBEYED.sub(lambda sign: sign[0].encode("unicode_escape").decode("ascii"), text)
@@ -62,35 +69,24 @@ def shown(value: object) -> str:
     return _brief.repr(value)
 
 
-def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:
-    """A hint with the known names nearest to ``name``, or all known names if none is near.
+def one_line(error: BaseException) -> str:
+    """The message of an exception in one line, or its type if it has no message."""
+    return " ".join(str(error).split()) or type(error).__name__
 
-    If there are many known names and none is near, the hint is empty.
-    """
-    known = list(dict.fromkeys(known))
+
+def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:
+    """A hint with the nearest known names; or if none is near, with all, unless they are many."""
     by_lower_case = {option.lower(): option for option in known}
-    near = [other for other in OTHER_NAMES.get(name.lower(), ()) if other in known] or [
+    near = [other for other in OTHER_NAMES.get(name.lower(), ()) if other in by_lower_case] or [
         by_lower_case[match] for match in difflib.get_close_matches(name.lower(), by_lower_case, n)
     ]
     if near:
         return f"did you mean {' or '.join(map(repr, near))}?"
-    return f"known are {', '.join(known)}" if 0 < len(known) <= _SHORT_LIST else ""
+    names = by_lower_case.values()
+    return f"known are {', '.join(names)}" if 0 < len(names) <= _SHORT_LIST else ""
 
 
 def unknown(what: str, name: str, known: Iterable[str], n: int = 1) -> UserError:
     """The error for a ``name`` that is not among ``known``: "{what} 'name': did you mean ...?"."""
     hint = did_you_mean(name, known, n)
     return UserError(f"{what} {shown(name)}{': ' if hint else ''}{hint}")
-
-
-def one_line(error: BaseException) -> str:
-    """The message of an exception in one line, or its type if it has no message."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-class Stopped(Exception):  # noqa: N818  # no error
-    """A signal, whose number it has, has ended the work at a safe moment."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number

@@ -39,11 +39,7 @@ def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def read_bytes(path: Path, limit: int = MAX_TEXT) -> bytes:
-    """The content of a regular file of at most ``limit`` bytes.
-
-    Raises:
-        UserError: if the file is missing, unreadable, too large, or not a regular file.
-    """
+    """The content of a regular file of at most ``limit`` bytes; UserError if it is none."""
     try:
         return read_file(path, limit)
     except UnsafeFileError as error:
@@ -71,12 +67,9 @@ def read_json(path: Path, limit: int = MAX_TEXT) -> Any:
 def read_arrays(
     path: Path, shapes: Mapping[str, str], optional: Collection[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Arrays of numbers in a NumPy archive, which is read as data.
+    """Arrays of numbers in a NumPy archive, which is read as data; the ``optional`` may be missing.
 
-    Args:
-        path: the archive.
-        shapes: names of arrays, and of their axes: axes of one name must have the same length.
-        optional: names of arrays that may be missing.
+    ``shapes`` has the names of arrays and of their axes: those of one name have the same length.
     """
     from rl_yardstick.safe_files.archives import read_members
 

@@ -67,11 +67,7 @@ class Model:
 
 
 def find_model(wanted: Wanted) -> Model:
-    """Find the requested model, without importing torch.
-
-    Raises:
-        UserError: if there is none, or it needs modules that were not typed.
-    """
+    """Find the requested model, without importing torch or modules that were not typed."""
     path = wanted.path or _find_run(wanted)
     with_suffix = path.with_name(f"{path.name}.zip")
     if not (path / RECORD).exists() and with_suffix.is_file():
@@ -162,11 +158,7 @@ def replay_buffer_of(model: Path) -> Path | None:
 
 
 def zip_data(path: Path) -> dict[str, Any]:
-    """The JSON in an agent's zip; pickles in it stay text.
-
-    Raises:
-        UserError: if the file is no whole zip of an agent.
-    """
+    """The JSON in an agent's zip; pickles in it stay text."""
     from rl_yardstick.safe_files.archives import first_look
 
     content = read_bytes(path, MAX_MODEL)
@@ -248,25 +240,21 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
 def load(spec: TrainSpec, path: Path, env: VecEnv | None, **replaced: Any) -> BaseAlgorithm:
     """The agent in a zip, which is read as data: nothing in it runs.
 
-    ``spec`` names the agent, and the modules whose networks and buffers a zip may name;
-    ``replaced`` are attributes of the agent to change.
-
-    Raises:
-        UserError: if it is no agent of this kind.
+    A zip may name networks and buffers in ``spec.gym_packages``; ``replaced`` are attributes of
+    the agent to change.
     """
     from rl_yardstick.safe_files.models import load_model
 
     algorithm: Any = load_algorithm(spec.algo)
-    content, found = io.BytesIO(read_bytes(path, MAX_MODEL)), None
+    content = io.BytesIO(read_bytes(path, MAX_MODEL))
     try:
         if _has_own_load(algorithm):
-            found = algorithm.load(content, env=env, **replaced)
-        else:
-            with warnings.catch_warnings():
-                # About a buffer that the library itself has chosen.
-                warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
-                classes = _own_classes(algorithm, spec.gym_packages)
-                found = load_model(algorithm, content, env, classes=classes, **replaced)
+            return algorithm.load(content, env=env, **replaced)  # type: ignore[no-any-return]
+        with warnings.catch_warnings():
+            # About a buffer that the library itself has chosen.
+            warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
+            classes = _own_classes(algorithm, spec.gym_packages)
+            return load_model(algorithm, content, env, classes=classes, **replaced)  # type: ignore[no-any-return]
     except UserError:
         raise
     except Exception as error:  # a file of another agent can fail anywhere in the library
@@ -277,8 +265,6 @@ def load(spec: TrainSpec, path: Path, env: VecEnv | None, **replaced: Any) -> Ba
             way_out = f"; train.py -i continues with another value: -params {key}:VALUE"
         what = f"{path} cannot be loaded as a {spec.algo} agent: {one_line(error)}"
         raise UserError(f"{what}{way_out}") from error
-    agent: BaseAlgorithm = found
-    return agent
 
 
 def _has_own_load(algorithm: type[BaseAlgorithm]) -> bool:
@@ -294,13 +280,13 @@ def _own_classes(algorithm: type[BaseAlgorithm], typed: list[str]) -> Mapping[st
     from stable_baselines3.common.buffers import BaseBuffer
     from torch import nn, optim
 
+    kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     homes = tuple(f"{home}." for home in (*map(module_name, typed), algorithm.__module__))
     modules = [one for name, one in list(sys.modules.items()) if f"{name}.".startswith(homes)]
     values = [value for module in modules for value in list(vars(module).values())]
-    kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     classes = [one for one in values if isinstance(one, type) and issubclass(one, kinds)]
-    own = [one for one in classes if f"{one.__module__}.".startswith(homes)]
-    return {f"{one.__module__}.{one.__qualname__}": one for one in own}
+    named = {f"{one.__module__}.{one.__qualname__}": one for one in classes}
+    return {name: one for name, one in named.items() if name.startswith(homes)}
 
 
 # --- statistics, and training further -------------------------------------------------------------
@@ -336,19 +322,13 @@ def take_statistics(env: Any, path: Path) -> None:
     if inside is None:
         raise UserError(f"{path}: the environments here are not normalised")
     if inside.norm_obs and saved.settings["norm_obs"]:
-        here, there = (
-            {
-                key: one.mean.shape
-                for key, one in (rms if isinstance(rms, dict) else {"": rms}).items()
-            }
-            for rms in (inside.obs_rms, saved.obs_rms)
-        )
+        given = [
+            rms if isinstance(rms, dict) else {"": rms} for rms in (saved.obs_rms, inside.obs_rms)
+        ]
+        there, here = ({key: one.mean.shape for key, one in rms.items()} for rms in given)
         if here != there:
-            shapes = [one.get("", one) for one in (there, here)]
-            raise UserError(
-                f"{path} holds statistics of observations of shape {shapes[0]}; the environment "
-                f"gives {shapes[1]}"
-            )
+            fault = f"holds statistics of observations of shape {there.get('', there)}"
+            raise UserError(f"{path} {fault}; the environment gives {here.get('', here)}")
         inside.obs_rms = saved.obs_rms
     inside.ret_rms = saved.ret_rms
 
@@ -363,6 +343,9 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
     """The agent of ``spec.trained_agent`` on its new environments, with its replay buffer."""
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+    from rl_yardstick.agents.library import MaskedReplayBuffer
+    from rl_yardstick.safe_files.buffers_and_statistics import load_replay_buffer
+
     path = Path(spec.trained_agent or "")
     # The networks come from the file, so these arguments cannot apply.
     given = {k: v for k, v in arguments.items() if k not in ("policy", "policy_kwargs")}
@@ -372,24 +355,18 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
     agent = load(spec, path, env, **given)
     if (statistics := statistics_of(path)) is not None and agent.get_vec_normalize_env():
         take_statistics(env, statistics)
-    if (buffer := replay_buffer_of(path)) is not None and isinstance(agent, OffPolicyAlgorithm):
-        _load_replay_buffer(agent, buffer)
-    return agent
-
-
-def _load_replay_buffer(agent: Any, path: Path) -> None:
-    from rl_yardstick.agents.library import MaskedReplayBuffer
-    from rl_yardstick.safe_files.buffers_and_statistics import load_replay_buffer
-
-    wanted = agent.replay_buffer
-    content = io.BytesIO(read_bytes(path, MAX_MODEL))
+    buffer = replay_buffer_of(path)
+    if buffer is None or not isinstance(agent, OffPolicyAlgorithm):
+        return agent
+    content, wanted = io.BytesIO(read_bytes(buffer, MAX_MODEL)), agent.replay_buffer
     try:
         load_replay_buffer(agent, content, classes={MaskedReplayBuffer, type(wanted)})
     except (ValueError, AssertionError) as error:
-        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
+        raise UserError(f"{buffer} cannot be read: {one_line(error)}") from error
     found, needed = (
         f"{type(one).__name__} of n_envs:{one.n_envs} and n_steps:{getattr(one, 'n_steps', 1)}"
         for one in (agent.replay_buffer, wanted)
     )
     if found != needed:
-        raise UserError(f"{path} holds a {found}; these hyperparameters need a {needed}")
+        raise UserError(f"{buffer} holds a {found}; these hyperparameters need a {needed}")
+    return agent

@@ -56,23 +56,18 @@ class Stop:
 
 
 class Run:
-    """A run folder, held by this process while the ``with`` statement lasts.
-
-    Attributes:
-        path: ``<log folder>/<algo>/<env>_<n>``.
-        console: where progress and results are printed.
-        stop: asked between two pieces of work whether to go on.
-        is_new: whether this process has made the folder.
-        has_begun: whether the agent is about to take steps; a new run without any leaves no folder.
-    """
+    """A run folder, held by this process while the ``with`` statement lasts."""
 
     def __init__(
         self, path: Path, console: Console | None = None, stop: Stop | None = None
     ) -> None:
-        self.path = path
+        self.path = path  # <log folder>/<algo>/<env>_<n>
+        self.state_path = path / STATE  # from which the training can go on
+        self.best_model_path = path / "best_model.zip"  # of the agent that evaluated best
         self.console = console or Console(quiet=True)
-        self.stop = stop or Stop()
-        self.is_new = self.has_begun = False
+        self.stop = stop or Stop()  # asked between two pieces of work whether to go on
+        self.is_new = False  # whether this process has made the folder
+        self.has_begun = False  # about to take steps; a new run without any leaves no folder
         self._lock = FileLock(path / LOCK, timeout=0)
 
     @classmethod
@@ -110,16 +105,6 @@ class Run:
 
     # --- files ------------------------------------------------------------------------------------
 
-    @property
-    def state_path(self) -> Path:
-        """The state from which the training can go on."""
-        return self.path / STATE
-
-    @property
-    def best_model_path(self) -> Path:
-        """The zip of the agent that evaluated best."""
-        return self.path / "best_model.zip"
-
     def model_path(self, spec: TrainSpec) -> Path:
         """The zip of the agent at the end."""
         return self.path / f"{spec.env_name}.zip"
@@ -137,11 +122,7 @@ class Run:
         return data if isinstance(data, dict) else {}
 
     def spec(self) -> TrainSpec:
-        """The spec in ``run.json``, which is data.
-
-        Raises:
-            UserError: if there is none.
-        """
+        """The spec in ``run.json``, which is data; UserError if there is none."""
         try:
             return TrainSpec.model_validate(self.recorded()["spec"])
         except (ValidationError, LookupError, TypeError) as error:
@@ -199,18 +180,14 @@ def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:
 
 
 def resumable(path: Path) -> TrainSpec:
-    """The spec of an unfinished run.
-
-    Raises:
-        UserError: if it has finished, or other versions would give other bits.
-    """
+    """The spec of a run; UserError if it has finished, or if versions and so bits would differ."""
     run = Run(path)
     spec, recorded = run.spec(), run.recorded()
     if recorded.get("state") == FINISHED:
         raise UserError(f"{path} is finished already")
-    for name, version in versions().items() if run.state_path.exists() else ():
-        was = recorded.get("versions", {}).get(name)
-        if was != version:
+    begun_with = recorded.get("versions", {}) if run.state_path.exists() else versions()
+    for name, version in versions().items():
+        if (was := begun_with.get(name)) != version:
             raise UserError(f"{path} was begun with {name} {was}, here is {version}")
     return spec
 

@@ -33,11 +33,9 @@ SPECIAL = (*BUDGETS, *COMPONENTS, *ENV_KWARGS, *_OTHERS)
 # What rl_zoo3's files have and what is decided elsewhere here.
 _SET_ELSEWHERE = {
     "action_noise": "noise_type and noise_std",
-    "seed": "--seed",
-    "device": "--device",
-    "verbose": "--verbose",
     "tensorboard_log": "--tensorboard-log",
 }
+_SET_ELSEWHERE |= {"seed": "--seed", "device": "--device", "verbose": "--verbose"}
 _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 
 
@@ -45,10 +43,7 @@ _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Plain values, and what rl_zoo3 writes into run folders: ordered mappings and tuples.
-
-    The same key twice is a mistake.
-    """
+    """Plain values, and rl_zoo3's ordered mappings and tuples; no key may be there twice."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys = [key.value for key, _ in node.value if key.value != "<<"]  # before they are merged
@@ -59,26 +54,19 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
             raise yaml.YAMLError(f"line {line}: the key {shown(twice)} is there twice")
         return found
 
-    def construct_pairs_of_python(self, node: Any) -> dict[Any, Any]:
-        (pairs,) = self.construct_sequence(node, deep=True)
-        return dict(pairs)
-
-    def construct_tuple_of_python(self, node: Any) -> Any:
-        return self.construct_sequence(node, deep=True)
-
 
 _PYTHON = "tag:yaml.org,2002:python"
-_ORDERED = f"{_PYTHON}/object/apply:collections.OrderedDict"
-_Loader.add_constructor(_ORDERED, _Loader.construct_pairs_of_python)
-_Loader.add_constructor(f"{_PYTHON}/tuple", _Loader.construct_tuple_of_python)
+_Loader.add_constructor(
+    f"{_PYTHON}/tuple", lambda loader, node: loader.construct_sequence(node, deep=True)
+)
+_Loader.add_constructor(
+    f"{_PYTHON}/object/apply:collections.OrderedDict",
+    lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0]),
+)
 
 
 def read_yaml(path: Path) -> Any:
-    """The plain values in a YAML file.
-
-    Raises:
-        UserError: if it cannot be read, or asks for objects.
-    """
+    """The plain values in a YAML file; UserError if it cannot be read, or asks for objects."""
     return parse_yaml(read_text(path), str(path))
 
 
@@ -103,8 +91,11 @@ def read_saved(path: Path) -> dict[str, Any]:
     return {key: _read_dict(value) for key, value in found.items()}
 
 
-def read_entries(path: Path) -> dict[str, Any]:
-    """All entries of a file of hyperparameters, with ``tuned_on``."""
+def _read_file(algo: str, path: Path | None) -> dict[str, Any] | None:
+    """All entries of an agent's shipped file, or of another one; None if none is shipped."""
+    path = path or HYPERPARAMS / f"{algo}.yml"
+    if path.parent == HYPERPARAMS and not path.is_file():
+        return None
     if path.suffix == ".py":
         raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
     return _check_names(read_yaml(path), f"{path} must map environment ids to hyperparameters")
@@ -122,12 +113,10 @@ def read_entry(
     """
     from gymnasium import registry
 
-    shipped = HYPERPARAMS / f"{algo}.yml"
-    if path is None and not shipped.is_file():
+    if (entries := _read_file(algo, path)) is None:
         return {}
-    path = path or shipped
-    entries, own = read_entries(path), registry.get(env_id)
-    key = _key(entries, env_id)
+    key, own = _key(entries, env_id), registry.get(env_id)
+    path = path or HYPERPARAMS / f"{algo}.yml"
     if env_kwargs and own is not None:
         meant = own.entry_point, {**own.kwargs, **env_kwargs}, own.max_episode_steps
         named = [registry[name] for name in entries if name in registry]
@@ -150,19 +139,16 @@ def _key(entries: Mapping[str, Any], env_id: str) -> str | None:
 
 def seeds_tuned_on(algo: str, env_id: str, path: Path | None = None) -> tuple[range, ...] | None:
     """The seeds on which an environment's entry was tuned; None if its file does not say."""
-    shipped = HYPERPARAMS / f"{algo}.yml"
-    if path is None and not shipped.is_file():
-        return None
-    entries = read_entries(path or shipped)
-    if TUNED_ON not in entries:
-        return () if path is None else None
+    entries = _read_file(algo, path)
+    if entries is None or TUNED_ON not in entries:
+        return None if entries is None or path is not None else ()
     try:
         given = entries[TUNED_ON].get(_key(entries, env_id) or "", [])
         ranges = given if type(given) is list else [given]
         return tuple(range(one["first"], one["first"] + one["count"]) for one in ranges)
     except (AttributeError, LookupError, TypeError) as error:
         form = "must map entries to seeds such as {first: 0, count: 10}"
-        raise UserError(f"{path or shipped}: {TUNED_ON} {form}") from error
+        raise UserError(f"{path or algo}: {TUNED_ON} {form}") from error
 
 
 def entry_names(algo: str) -> list[str]:
@@ -285,14 +271,8 @@ def _components(value: Any, where: str) -> list[dict[str, Any]]:
 def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -> TrainSpec:
     """The spec of an entry, with numbers in place of ``auto``; its ``origins`` tell how.
 
-    Args:
-        algo: the agent.
-        env_id: the environment, which is registered.
-        entry: its hyperparameters.
-        fields: other fields of `TrainSpec`.
-
-    Raises:
-        UserError: for an agent, a key or a value that does not exist or does not fit.
+    ``fields`` are other fields of `TrainSpec`. Raises UserError for an agent, a key or a value that
+    does not exist or does not fit.
     """
     check_agent(algo)
     entry = {key: _read_dict(value) for key, value in entry.items() if value is not None}
@@ -315,19 +295,11 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
         # As in rl_zoo3, rewards are normalised with the agent's discount.
         special["normalize"].setdefault("gamma", algorithm["gamma"])
     asked = [key for key in AUTO if algorithm.get(key) == "auto"]
-    steps = str(special.get("n_timesteps", ""))
-    if steps.startswith("auto"):
-        special["n_timesteps"] = None
-        if not _STEPS.fullmatch(steps):
-            form = "auto, or auto_1000 with the steps for each pair of state and action"
-            raise UserError(f"n_timesteps: {steps!r} is not {form}")
-    else:
-        steps = ""
     plain = {key: value for key, value in algorithm.items() if key not in asked}
+    if str(special.get("n_timesteps")).startswith("auto"):
+        asked.insert(0, str(special.pop("n_timesteps")))
     found = {"algo": algo, "env_id": env_id, "algorithm": plain, **special, **fields}
-    spec = _with_rewards(validated(found))
-    if asked or steps:
-        spec = _with_numbers(spec, asked, steps)
+    spec = _with_numbers(_with_rewards(validated(found)), asked)
     if not (spec.n_timesteps or spec.n_episodes):
         raise UserError("the training has no budget: give -n STEPS or --n-episodes N")
     return spec
@@ -354,15 +326,8 @@ def shipped_hyperparams(spec: TrainSpec) -> dict[str, Any]:
 
 
 # --- the values of ``auto``, which follow from the environment's size and rewards ----------------
-#
-# - ``gamma: auto`` is 1 - 1/(2 x time limit of evaluations): a reward one time limit ahead has the
-#   weight 0.6.
-# - ``n_timesteps: auto_K`` is K steps for each pair of state and action, for at least 100 pairs;
-#   ``auto`` is ``auto_2500``.
-# - ``learning_rate: auto`` falls from 0.3 to 10 x pairs / steps, within 0.003 and 0.05.
-# - ``initial_q: auto`` and ``value_bound: auto`` are the highest reward that ends an episode.
-# - In ``train_env_wrapper``, ``scale: auto`` is 1 / the largest absolute reward; ``min_reward:
-#   auto`` is the lowest reward, but at least -1/10 of a positive highest one.
+
+# With gamma, a reward one time limit ahead has the weight 0.6.
 
 STEPS_PER_PAIR, FEWEST_PAIRS = 2500, 100  # training steps per state and action
 VISITS_AVERAGED = 10  # a step size of 1 / n averages over about the last n visits
@@ -370,13 +335,15 @@ FIRST_STEP_SIZE, LAST_STEP_SIZES = 0.3, (0.003, 0.05)
 _STEPS = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
 
-def _with_numbers(spec: TrainSpec, asked: list[str], steps: str) -> TrainSpec:
+def _with_numbers(spec: TrainSpec, asked: list[str]) -> TrainSpec:
     """Settings of tables, from the evaluation environment."""
     from gymnasium.spaces import Discrete
 
     from rl_yardstick.envs.known_models import time_limit, transition_model
     from rl_yardstick.pipeline.environments import check_fit, make_single_env
 
+    if not asked:
+        return spec
     check_fit(spec)
     where, n_timesteps = f"{spec.algo} on {spec.env_id}", spec.n_timesteps
     origins, algorithm = dict(spec.origins), dict(spec.algorithm)
@@ -385,28 +352,28 @@ def _with_numbers(spec: TrainSpec, asked: list[str], steps: str) -> TrainSpec:
         counts = [int(space.n) for space in spaces if isinstance(space, Discrete)]
         if len(counts) < 2:
             raise UserError(f"{where}: auto needs Discrete observations and actions")
-        states, actions = counts
-        if steps:
-            per_pair = int(steps[5:] or STEPS_PER_PAIR)
-            pairs = max(states * actions, FEWEST_PAIRS)
-            least = f", counted as {pairs} pairs" if pairs > states * actions else ""
-            n_timesteps = per_pair * pairs
-            how = f"{per_pair:,} for each pair of {states:,} states and {actions:,} actions{least}"
-            origins["n_timesteps"] = f"auto: {how}"
+        n_pairs = counts[0] * counts[1]
         for key in asked:
-            if key == "gamma":
+            if key.startswith("auto"):
+                if (match := _STEPS.fullmatch(key)) is None:
+                    form = "auto, or auto_1000 with the steps for each pair of state and action"
+                    raise UserError(f"n_timesteps: {key!r} is not {form}")
+                per_pair, pairs = int(match[1] or STEPS_PER_PAIR), max(n_pairs, FEWEST_PAIRS)
+                n_timesteps = per_pair * pairs
+                size = "{:,} states and {:,} actions".format(*counts)
+                least = f", counted as {pairs} pairs" if pairs > n_pairs else ""
+                origins["n_timesteps"] = f"auto: {per_pair:,} for each pair of {size}{least}"
+            elif key == "gamma":
                 if (limit := time_limit(env)) is None:
                     raise UserError(f"{where}: gamma: auto needs an environment with a time limit")
                 algorithm[key] = round(1 - 1 / (2 * limit), 7)
                 origins[key] = f"auto: 1 - 1/(2 x time limit of {limit:,})"
             elif key == "learning_rate":
                 low, high = LAST_STEP_SIZES
-                last, origins[key] = high, "auto"
-                if n_timesteps is not None:
-                    last = min(max(VISITS_AVERAGED * states * actions / n_timesteps, low), high)
-                    rule = f"{VISITS_AVERAGED} x states x actions / steps"
-                    origins[key] = f"auto: ends at {rule}, within {low} and {high}"
-                algorithm[key] = f"exp_{FIRST_STEP_SIZE:g}_{last:.2g}"
+                last = VISITS_AVERAGED * n_pairs / n_timesteps if n_timesteps else high
+                algorithm[key] = f"exp_{FIRST_STEP_SIZE:g}_{min(max(last, low), high):.2g}"
+                rule = f"ends at {VISITS_AVERAGED} x states x actions / steps"
+                origins[key] = f"auto: {rule}, within {low} and {high}" if n_timesteps else "auto"
             else:
                 model = transition_model(env)
                 if model is None or not (ends := model.terminated & (model.prob > 0)).any():
@@ -444,7 +411,5 @@ def _with_rewards(spec: TrainSpec) -> TrainSpec:
             kwargs[key] = value
             told.append(f"{key} auto: {how}")
         wrappers[place] = wrapper.model_copy(update={"kwargs": kwargs})
-    if not told:
-        return spec
-    origins = {**spec.origins, "train_env_wrapper": "; ".join(told)}
-    return spec.changed(train_env_wrapper=wrappers, origins=origins)
+    origins = {"train_env_wrapper": "; ".join(told)} if told else {}
+    return spec.changed(train_env_wrapper=wrappers, origins={**spec.origins, **origins})

@@ -78,8 +78,7 @@ def save_state(path: Path, roots: dict[str, Any], process: tuple[str, ...]) -> N
 def load_state(path: Path, roots: dict[str, Any]) -> None:
     """Put a saved state into the roots of a training that was made with the same spec.
 
-    Raises:
-        UserError: if the state is not signed by this user.
+    Raises UserError if the state is not signed by this user.
     """
     content = read_bytes(path, MAX_STATE)
     if not hmac.compare_digest(content[:32], hmac.digest(_key(), content[32:], "sha256")):

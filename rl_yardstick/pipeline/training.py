@@ -23,14 +23,12 @@ from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.machine_code.compiling import compile_timer
 from rl_yardstick.pipeline.callbacks import (
     Checkpoint,
-    Clock,
     EvaluationCallback,
     ProgressCallback,
     PullRecorder,
     PullSummary,
     StateCallback,
     evaluation_frequencies,
-    summarise_pulls,
 )
 from rl_yardstick.pipeline.components import action_noise, build, constructor_arguments
 from rl_yardstick.pipeline.environments import first_seed, make_training_env, training_changes
@@ -59,13 +57,10 @@ def train(
     resumes: bool = False,
     tell: Callable[[Training], object] = lambda training: None,
 ) -> Training:
-    """Train an agent and leave a finished run folder.
+    """Train an agent and leave a finished run folder, which is held by the caller.
 
-    Args:
-        spec: the training.
-        run: its folder, held by the caller.
-        resumes: whether to go on from the folder's state, if it has one.
-        tell: is given the training before it begins.
+    With ``resumes``, it goes on from the folder's state, if there is one. ``tell`` is given the
+    training before it begins.
 
     Raises:
         UserError: if something does not fit; a new run without a step leaves no folder.
@@ -111,17 +106,11 @@ class Training:
     With ``resumes``, the state in the run folder is put back before the first step.
     """
 
-    n_timesteps: int  #: environment steps done
-    taken: WorkTime  #: the time of training and its evaluations, without compiling
     final: Evaluation | None = None  #: of the agent at the end; None if there are no evaluations
-    best: float | None  #: mean return of the best evaluation during training
-    best_timesteps: int  #: the step of that evaluation
-    best_episodes: int  #: its episodes; 0 if it is exact
-    evaluating: WorkTime  #: the time of all evaluations, including the last one
-    evaluation_steps: int  #: environment steps of sampled evaluations
-    engine: str | None  #: whether training was compiled, and if not, why; None if unknown
     pulled: PullSummary | None = None  #: of a training on a bandit
     advice: Advice | None = None  #: on an agent that has failed
+    engine: str | None = None  #: whether it was compiled, and if not, why; None if unknown
+    evaluation_steps = 0  #: environment steps of sampled evaluations
 
     def __init__(self, spec: TrainSpec, run: Run, agent: BaseAlgorithm, resumes: bool) -> None:
         self.spec, self.run, self.agent = spec, run, agent
@@ -145,7 +134,6 @@ class Training:
         if is_bandit and getattr(agent, "engine", None) == "compiled":  # it stops at no pull
             self.pulls, note = None, "engine: compiled keeps no pulls, so regret is not known"
             run.console.print(note, style="dim")
-        self.clock = Clock()
         on_variant = bool(training_changes(spec))
         self.progress = ProgressCallback(run.console, spec.total_timesteps, on_variant)
         self.callback = self._callbacks(resumes)
@@ -178,34 +166,28 @@ class Training:
             Checkpoint(None, every_n_episodes, **checkpoint) if every_n_episodes > 0 else None,
             *(self.pulls, self.evaluation.critics, watch, self.evaluation),
             EpisodeBudget(spec.n_episodes) if spec.n_episodes is not None else None,
-            *(self.clock, self.progress),
+            self.progress,
         ]
         others = [callback for callback in possible if callback is not None]
-        saver = StateCallback(self.run, resumes, self.clock, self.judge, others)
+        saver = StateCallback(self.run, resumes, self.judge, others, self.progress)
         return CallbackList([NumberWatch(), saver, *others])
 
     def learn(self) -> None:
-        """Let the agent learn.
-
-        Raises:
-            UserError: for a library's error about the settings; those of the user's own code go
-                through as they are.
-        """
+        """Let the agent learn; errors of the user's own code go through as they are."""
         spec, agent, interval = self.spec, self.agent, self.spec.log_interval
-        if not (spec.tensorboard_log or spec.library_log):
-            interval = -2  # nobody reads it
-        kwargs: dict[str, Any] = {"log_interval": interval if interval > 0 else None}
+        is_read = spec.tensorboard_log or spec.library_log
+        kwargs: dict[str, Any] = {"log_interval": interval if interval > 0 and is_read else None}
         try:
             with compile_timer() as time_compiling:
-                self.clock.start(time_compiling)
+                self.progress.start_clock(time_compiling)
                 agent.learn(
                     spec.total_timesteps,
                     callback=self.callback,
                     tb_log_name=spec.algo,
                     reset_num_timesteps=spec.trained_agent is None,
-                    **({} if interval == -1 else kwargs),
+                    **({} if interval == -1 and is_read else kwargs),
                 )
-                self.clock.stop()
+                self.progress.read_clock()
         except OF_LIBRARIES as e:
             check_model(agent)  # PyTorch's error for nan in distributions is obscure
             raised_in = traceback.extract_tb(e.__traceback__)[-1].filename
@@ -226,8 +208,8 @@ class Training:
                 agent.save_replay_buffer(beside)
 
     def judge_the_end(self) -> None:
-        """Do missing evaluations and the final one, and collect the results."""
-        evaluation, agent, spec = self.evaluation, self.agent, self.spec
+        """Do missing evaluations and the final one."""
+        evaluation, agent = self.evaluation, self.agent
         if evaluation.is_asked_for:
             if not evaluation.evaluations_timesteps:  # the run was shorter than their interval
                 evaluation.init_callback(agent)
@@ -238,43 +220,35 @@ class Training:
             if evaluation.critics is not None:
                 evaluation.critics.finish(agent.num_timesteps)
             evaluation.take_statistics()
-            begun = WorkTime.now()
+            begun, evaluator = WorkTime.now(), evaluation.evaluator
             self.final = self.judge.at_the_end(agent)
             evaluation.taken += WorkTime.now() - begun
             if not self.run.console.quiet:
-                judge = evaluation.evaluator
-                self.advice = advice(spec, agent, judge, self.final, agent.num_timesteps)
-        self.n_timesteps, self.taken = agent.num_timesteps, self.clock.taken
-        self.best, self.best_timesteps = evaluation.best, evaluation.best_timesteps
-        self.best_episodes, self.evaluating = evaluation.best_episodes, evaluation.taken
-        self.evaluation_steps = getattr(evaluation.evaluator, "n_steps", 0)
+                self.advice = advice(self.spec, agent, evaluator, self.final, agent.num_timesteps)
+            self.evaluation_steps = getattr(evaluator, "n_steps", 0)
         self.engine = getattr(agent, "engine_in_use", None)
         if self.pulls is not None and self.pulls.n_calls > 0:
-            self.pulled = summarise_pulls(self.pulls.arrays())
+            self.pulled = self.pulls.summary()
 
     def figures(self) -> dict[str, Any]:
         """The figures for ``run.json``."""
-        pulled, refusal = self.pulled, self.judge.refusal
+        evaluation, pulled, refusal = self.evaluation, self.pulled, self.judge.refusal
         return {
-            "n_timesteps": self.n_timesteps,
+            "n_timesteps": self.agent.num_timesteps,
             "final": None if self.final is None else self.final.summary(),
-            "best_mean_return": self.best,
-            "best_timesteps": self.best_timesteps,
-            "best_episodes": self.best_episodes,
+            "best_mean_return": evaluation.best,
+            "best_timesteps": evaluation.best_timesteps,
+            "best_episodes": evaluation.best_episodes,
             "evaluation_steps": self.evaluation_steps,
             "engine": self.engine,
-            **self.taken.as_data(),
+            **self.progress.taken.as_data(),
             **({} if pulled is None else {"regret": pulled.regret, "pulls": asdict(pulled)}),
             **({} if refusal is None else {"model_refused": refusal}),
         }
 
 
 def make_agent(spec: TrainSpec, folder: Path | None, appending: bool = False) -> BaseAlgorithm:
-    """The agent on its training environments, whose Monitors write into ``folder``.
-
-    Raises:
-        UserError: if the constructor refuses an argument.
-    """
+    """The agent on its training environments, whose Monitors write into ``folder``."""
     algorithm: Any = load_algorithm(spec.algo)
     env = make_training_env(spec, folder, appending)
     log = None if spec.tensorboard_log is None else Path(spec.tensorboard_log) / spec.env_name
