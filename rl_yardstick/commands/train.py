@@ -409,8 +409,9 @@ def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
     from rl_yardstick.commands.terminal import APART, describe_others, judged
 
     taken, final = outcome.progress.taken.cpu_seconds, outcome.final
-    speed = outcome.agent.num_timesteps / max(taken, 1e-9)
-    text = f"{outcome.agent.num_timesteps:,} steps in {taken:.1f} s of processor time ({speed:,.0f} steps/s)"
+    n_steps = outcome.agent.num_timesteps
+    speed = n_steps / max(taken, 1e-9)
+    text = f"{n_steps:,} steps in {taken:.1f} s of processor time ({speed:,.0f} steps/s)"
     rows = [("trained", text)]
     if outcome.engine:
         rows.append(("engine", outcome.engine))
@@ -422,7 +423,7 @@ def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
         rows.append(("best", APART.join([*best, f"at step {outcome.evaluation.best_timesteps:,}"])))
     if final is not None:
         tests = f"{outcome.evaluation.taken.cpu_seconds:.1f} s of processor time"
-        share = outcome.evaluation_steps / max(outcome.agent.num_timesteps, 1)
+        share = outcome.evaluation_steps / max(n_steps, 1)
         played = f"{outcome.evaluation_steps:,} steps beside training ({share:.0%} of it)"
         how = played if outcome.evaluation_steps else "exact, no episodes sampled"
         rows.append(("tests", f"{how}; {tests}"))

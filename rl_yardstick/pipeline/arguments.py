@@ -98,14 +98,8 @@ def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
 
 def _kinds(annotation: Any, default: Any = None) -> set[str]:
     """The kinds of plain value that an annotation admits; ``any`` for classes and the unknown."""
-    if annotation in (None, type(None), "None"):
+    if annotation in (None, type(None)):
         return {"None"}
-    if isinstance(annotation, str):
-        parts = annotation.split(" | ")
-        if len(parts) > 1:
-            return set().union(*map(_kinds, parts))
-        name = annotation.partition("[")[0]
-        return {name if name in _PLAIN else "schedule" if name == "Schedule" else "any"}
     if annotation is inspect.Parameter.empty and type(default) in (int, float):
         annotation = type(default)
     origin, members = typing.get_origin(annotation), typing.get_args(annotation)

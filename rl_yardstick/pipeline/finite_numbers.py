@@ -44,7 +44,7 @@ def check_numbers(values: Any, what: str, when: str, in_rows: bool = False) -> N
 
 
 def check_model(model: Any) -> None:
-    """Check that an agent's tables or weights and its statistics are finite."""
+    """Check that an agent's tables or weights are finite."""
     when, policy = f"at step {model.num_timesteps:,}", getattr(model, "policy", None)
     if isinstance(policy, th.nn.Module):
         for name, table in policy.state_dict().items():
@@ -54,14 +54,6 @@ def check_model(model: Any) -> None:
             if not th.isfinite(tensor).all():
                 values = tensor.detach().cpu().double().numpy()
                 check_numbers(values, f"a value in {name} of the agent", when)
-    normalization = model.get_vec_normalize_env()
-    for name in ("obs_rms", "ret_rms") if normalization is not None else ():
-        statistics = getattr(normalization, name, None)
-        parts = statistics if isinstance(statistics, dict) else {"": statistics}
-        for key, part in parts.items():
-            if part is not None:
-                what = f"{name} of VecNormalize{f' ({key})' if key else ''}"
-                check_numbers({"mean": part.mean, "variance": part.var}, what, when)
 
 
 class FinitePlayer:

@@ -221,15 +221,15 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
         "n_steps": 1,
     }
     if env is not None:
-        saved = zip_data(model.path).get("observation_space")
-        found, wanted = (
-            f"{one['n']} kinds" if "n" in one else f"shape {tuple(one.get('_shape') or ())}"
-            for one in (saved if isinstance(saved, dict) else {}, vars(env.observation_space))
+        saved, here = zip_data(model.path).get("observation_space"), vars(env.observation_space)
+        found, needed = (
+            one.get("n", tuple(one.get("_shape") or ())) if isinstance(one, dict) else None
+            for one in (saved, here)
         )
-        if saved is not None and found != wanted:
+        if found not in (None, needed):
             raise UserError(
-                f"{model.path} was trained on observations of {found}, and the environment "
-                f"here gives {wanted}: give the right --env-kwargs"
+                f"{model.path} was trained on observations of shape {found}, and the environment "
+                f"here gives shape {needed}: give the right --env-kwargs"
             )
         replaced["observation_space"] = env.observation_space
     small = {"buffer_size": 1, "optimize_memory_usage": False}
