@@ -124,7 +124,7 @@ def _discount(args: argparse.Namespace, spec: TrainSpec) -> float:
     found = spec.algorithm.get("gamma") if args.gamma is None else args.gamma
     if found is None:
         from rl_yardstick.agents import load_algorithm
-        from rl_yardstick.pipeline.arguments import constructor_parameters
+        from rl_yardstick.pipeline.components import constructor_parameters
 
         parameter = constructor_parameters(load_algorithm(spec.algo)).get("gamma")
         found = None if parameter is None else parameter.default

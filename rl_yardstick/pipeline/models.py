@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
-from rl_yardstick.pipeline.arguments import arguments_of
-from rl_yardstick.pipeline.components import check_typed, module_name
+from rl_yardstick.pipeline.components import arguments_of, check_typed, module_name
 from rl_yardstick.pipeline.environments import check_env_id
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.files import read_bytes

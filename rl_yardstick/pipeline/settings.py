@@ -18,7 +18,7 @@ from typing import Any
 import yaml
 
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.pipeline.arguments import AUTO, WRAPPERS, arguments_of, check_arguments
+from rl_yardstick.pipeline.components import AUTO, WRAPPERS, arguments_of, check_arguments
 from rl_yardstick.pipeline.errors import UserError, did_you_mean, shown, unknown
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec, validated
