@@ -258,13 +258,14 @@ _WORDS |= {"schedule": "a schedule such as lin_0.001", "dict": "a mapping", "lis
 _WORDS |= {"None": "none"}
 
 # Ranges that hold for every agent; an agent's own checks come when it is made.
+_SHARE, _COUNT, _POSITIVE = Field(ge=0, le=1), Field(ge=1, le=2**62), Field(ge=0)
 _RANGES = {
-    "gamma gae_lambda tau": Field(ge=0, le=1),
-    "exploration_fraction exploration_initial_eps exploration_final_eps": Field(ge=0, le=1),
-    "n_steps batch_size n_epochs buffer_size": Field(ge=1, le=2**62),
-    "train_freq target_update_interval stats_window_size": Field(ge=1, le=2**62),
-    "learning_starts temperature vf_coef target_kl": Field(ge=0),
-    "clip_range clip_range_vf rms_prop_eps max_grad_norm": Field(ge=0),
+    "gamma gae_lambda tau": _SHARE,
+    "exploration_fraction exploration_initial_eps exploration_final_eps": _SHARE,
+    "n_steps batch_size n_epochs buffer_size train_freq": _COUNT,
+    "target_update_interval stats_window_size": _COUNT,
+    "learning_starts temperature vf_coef target_kl clip_range": _POSITIVE,
+    "clip_range_vf rms_prop_eps max_grad_norm": _POSITIVE,
     "gradient_steps sde_sample_freq": Field(ge=-1),  # -1: each step, never
     # Larger rates overflow single precision in the first update.
     "learning_rate": Field(ge=0, le=1e37),

@@ -90,10 +90,8 @@ def find_model(wanted: Wanted) -> Model:
     if statistics is None and spec.normalize is not None:
         statistics = statistics_of(path)
         if statistics is None and spec.normalize.get("norm_obs", True):
-            raise UserError(
-                f"{path} was trained on normalised observations, but their statistics are "
-                "missing: name their file with --vec-normalize"
-            )
+            fault = "trained on normalised observations, but their statistics are missing"
+            raise UserError(f"{path} was {fault}: name their file with --vec-normalize")
     run = path.parent if (path.parent / RECORD).is_file() else None
     return Model(path, _as_saved(spec, data, statistics), run, statistics)
 
@@ -226,9 +224,10 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
             for one in (saved, here)
         )
         if found not in (None, needed):
+            fault = f"{found}, and the environment here gives shape {needed}"
             raise UserError(
-                f"{model.path} was trained on observations of shape {found}, and the environment "
-                f"here gives shape {needed}: give the right --env-kwargs"
+                f"{model.path} was trained on observations of shape {fault}: give the right "
+                "--env-kwargs"
             )
         replaced["observation_space"] = env.observation_space
     small = {"buffer_size": 1, "optimize_memory_usage": False}

@@ -19,7 +19,7 @@ import yaml
 
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.pipeline.components import AUTO, WRAPPERS, arguments_of, check_arguments
-from rl_yardstick.pipeline.errors import UserError, did_you_mean, shown, unknown
+from rl_yardstick.pipeline.errors import UserError, shown, unknown
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec, validated
 
@@ -106,10 +106,9 @@ def read_entry(
 ) -> dict[str, Any]:
     """The entry of an environment in ``hyperparams/<algo>.yml``, or in another file.
 
-    Atari games without an entry use the entry ``atari``, all others ``default``. An agent without
-    a file, such as the user's own, has an empty entry. If ``env_kwargs`` make the environment equal
-    to another id, that id's entry is used: for CliffWalking-v1 with ``is_slippery: True``, the
-    entry of CliffWalkingSlippery-v1.
+    Atari games without an entry use the entry ``atari``, all others ``default``; an agent without
+    a file an empty one. If ``env_kwargs`` make the environment equal to another id, that id's entry
+    is used: for CliffWalking-v1 with ``is_slippery: True``, the entry of CliffWalkingSlippery-v1.
     """
     from gymnasium import registry
 
@@ -123,11 +122,8 @@ def read_entry(
         same = [s.id for s in named if (s.entry_point, s.kwargs, s.max_episode_steps) == meant]
         key = same[0] if same else key
     if key is None:
-        hint = did_you_mean(env_id, entries, n=3)
-        raise UserError(
-            f"{path}: no entry for {shown(env_id)}{' (' + hint + ')' if hint else ''}; "
-            "give hyperparameters with -params, or another file with --conf-file"
-        )
+        way_out = "give hyperparameters with -params, or another file with --conf-file"
+        raise UserError(f"{unknown(f'{path}: no entry for', env_id, entries, n=3)}; {way_out}")
     entry = _check_names(entries[key], f"{path}: the entry {key} must map names to values")
     return {name: _read_dict(value) for name, value in entry.items()}
 
@@ -299,7 +295,11 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
     if str(special.get("n_timesteps")).startswith("auto"):
         asked.insert(0, str(special.pop("n_timesteps")))
     found = {"algo": algo, "env_id": env_id, "algorithm": plain, **special, **fields}
-    spec = _with_numbers(_with_rewards(validated(found)), asked)
+    spec = validated(found)
+    if any("auto" in wrapper.kwargs.values() for wrapper in spec.train_env_wrapper):
+        spec = _with_rewards(spec)
+    if asked:
+        spec = _with_numbers(spec, asked)
     if not (spec.n_timesteps or spec.n_episodes):
         raise UserError("the training has no budget: give -n STEPS or --n-episodes N")
     return spec
@@ -342,8 +342,6 @@ def _with_numbers(spec: TrainSpec, asked: list[str]) -> TrainSpec:
     from rl_yardstick.envs.known_models import time_limit, transition_model
     from rl_yardstick.pipeline.environments import check_fit, make_single_env
 
-    if not asked:
-        return spec
     check_fit(spec)
     where, n_timesteps = f"{spec.algo} on {spec.env_id}", spec.n_timesteps
     origins, algorithm = dict(spec.origins), dict(spec.algorithm)
@@ -402,14 +400,12 @@ def _with_rewards(spec: TrainSpec) -> TrainSpec:
             low, high = float(rewards.min()), float(rewards.max())
             largest = max(-low, high)
             if key == "scale":
-                value, how = 1 / largest if largest else 1.0, f"1 / the largest reward, {largest:g}"
+                kwargs[key], how = 1 / largest if largest else 1.0, "1 / the largest reward"
             elif high <= 0 or -high / 10 < low:
-                value, how = low, f"{low:g}, the lowest reward"
+                kwargs[key], how = low, "the lowest reward"
             else:  # large costs would teach a network to stand still
-                value = -high / 10
-                how = f"{value:g}, a tenth of the highest reward below zero"
-            kwargs[key] = value
-            told.append(f"{key} auto: {how}")
+                kwargs[key], how = -high / 10, "a tenth of the highest reward below zero"
+            told.append(f"{key} auto: {kwargs[key]:g}, {how}")
         wrappers[place] = wrapper.model_copy(update={"kwargs": kwargs})
-    origins = {"train_env_wrapper": "; ".join(told)} if told else {}
-    return spec.changed(train_env_wrapper=wrappers, origins={**spec.origins, **origins})
+    origins = {**spec.origins, "train_env_wrapper": "; ".join(told)}
+    return spec.changed(train_env_wrapper=wrappers, origins=origins)
