@@ -96,7 +96,7 @@ def main() -> int:
 
 def _subject(args: argparse.Namespace) -> Subject:
     """The algorithm that the arguments select; imports its module."""
-    from rl_yardstick.pipeline.modules import import_modules
+    from rl_yardstick.pipeline.components import import_modules
     from rl_yardstick.pipeline.settings import check_agent, parse_assignments
 
     name = args.algo or args.script

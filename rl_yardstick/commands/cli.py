@@ -130,7 +130,7 @@ def hint(words: Sequence[str], flags: Sequence[str]) -> str:
 
 def _hyperparameter(name: str) -> str:
     """The hyperparameter with this name, or with this as another name; empty for none."""
-    from rl_yardstick.pipeline.arguments import known_names
+    from rl_yardstick.pipeline.components import known_names
 
     return next((one for one in (name, *OTHER_NAMES.get(name, ())) if one in known_names()), "")
 
@@ -282,7 +282,7 @@ def check_device(device: str) -> None:
 
 def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dict[str, Any]:
     """The typed settings of an agent, with the value of ``--engine``, if given."""
-    from rl_yardstick.pipeline.arguments import arguments_of
+    from rl_yardstick.pipeline.components import arguments_of
 
     if word is None:
         return dict(settings)

@@ -133,7 +133,7 @@ def _margin(text: str) -> float:
 def main() -> int:
     """Do a study, or judge policies on a log; return the exit code."""
     args = build_parser().parse_args()
-    from rl_yardstick.pipeline.modules import check_typed, import_modules, split_id
+    from rl_yardstick.pipeline.components import check_typed, import_modules, split_id
     from rl_yardstick.pipeline.run import Stop
 
     stop = Stop().listen()
@@ -527,7 +527,7 @@ def typed_settings(args: argparse.Namespace) -> dict[str, Any]:
 def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     """The study with the settings of the command line in every agent."""
     from rl_yardstick.experiments.study import AS_IT_COMES, layered
-    from rl_yardstick.pipeline.arguments import arguments_of
+    from rl_yardstick.pipeline.components import arguments_of
 
     files = _conf_files(study, args.conf_file)
     changes = {**(AS_IT_COMES if args.as_it_comes else {}), **typed_settings(args)}

@@ -118,8 +118,8 @@ def wanted_model(args: argparse.Namespace) -> Wanted:
     """The model that the arguments ask for; imports the modules that were typed."""
     from secrets import randbelow
 
+    from rl_yardstick.pipeline.components import import_modules, split_id
     from rl_yardstick.pipeline.models import Wanted
-    from rl_yardstick.pipeline.modules import import_modules, split_id
     from rl_yardstick.pipeline.settings import parse_assignments
 
     module, env_id = split_id(args.env or "")

@@ -85,8 +85,8 @@ def main() -> int:
 
 def _spec(args: argparse.Namespace) -> TrainSpec:
     """The settings of the agent, with the changes in training."""
+    from rl_yardstick.pipeline.components import import_modules, split_id
     from rl_yardstick.pipeline.environments import check_env_id, with_files_read
-    from rl_yardstick.pipeline.modules import import_modules, split_id
     from rl_yardstick.pipeline.settings import (
         check_agent,
         override,
@@ -124,7 +124,7 @@ def _discount(args: argparse.Namespace, spec: TrainSpec) -> float:
     found = spec.algorithm.get("gamma") if args.gamma is None else args.gamma
     if found is None:
         from rl_yardstick.agents import load_algorithm
-        from rl_yardstick.pipeline.arguments import constructor_parameters
+        from rl_yardstick.pipeline.components import constructor_parameters
 
         parameter = constructor_parameters(load_algorithm(spec.algo)).get("gamma")
         found = None if parameter is None else parameter.default

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rl_yardstick.pipeline.callbacks import PullSummary
     from rl_yardstick.pipeline.run import Run
     from rl_yardstick.pipeline.spec import TrainSpec
-    from rl_yardstick.pipeline.training import Outcome, Parts
+    from rl_yardstick.pipeline.training import Training
 
 WATCHED = whole_number(1, besides={0: "those of the first 5,000 steps"})
 # Flags that may stand beside --resume: none of the training itself.
@@ -114,7 +114,7 @@ def main() -> int:
     """Train, resume or list."""
     args = build_parser().parse_args()
 
-    from rl_yardstick.pipeline.modules import import_modules, split_id
+    from rl_yardstick.pipeline.components import import_modules, split_id
     from rl_yardstick.pipeline.run import Run, Stop
 
     module, args.env = split_id(args.env)
@@ -155,7 +155,7 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
 
     console = run.console
 
-    def tell(parts: Parts) -> None:
+    def tell(parts: Training) -> None:
         outlook = engine_outlook(parts.agent, parts.spec, [parts.callback])
         if not console.quiet and (line := training_line(outlook, parts.agent, parts.callback)):
             say(console, f"engine   {line}", style="dim")
@@ -300,7 +300,7 @@ def check_alone(args: argparse.Namespace) -> None:
 
 def resumed_spec(path: Path, args: argparse.Namespace) -> TrainSpec:
     """The spec of an unfinished run, whose modules were typed."""
-    from rl_yardstick.pipeline.modules import check_typed
+    from rl_yardstick.pipeline.components import check_typed
     from rl_yardstick.pipeline.run import resumable
 
     if not path.is_dir():
@@ -372,7 +372,7 @@ def schedule_in_words(value: object) -> str:
     return f"{'falls' if end < start else 'rises'} {how} from {start:g} to {end:g}"
 
 
-def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Outcome) -> None:
+def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Training) -> None:
     """Print what was done, below it the result, and the commands to type next."""
     if console.quiet:
         return
@@ -384,7 +384,7 @@ def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Outcome)
     for row in rows_of(run, outcome):
         table.add_row(*row)
     print_rows(console, table)
-    results = [] if outcome.pulls is None else [describe_pulls(outcome.pulls)]
+    results = [] if outcome.pulled is None else [describe_pulls(outcome.pulled)]
     results += [] if outcome.final is None else result_lines(outcome.final)
     for line in [""] * bool(results) + results:
         say(console, line)
@@ -404,27 +404,26 @@ def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Outcome)
         say(console, f"learning {spec.watch_learning}: {words}")
 
 
-def rows_of(run: Run, outcome: Outcome) -> list[tuple[str, str]]:
+def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
     """What was done: labels and figures."""
     from rl_yardstick.commands.terminal import APART, describe_others, judged
 
-    taken, final = outcome.taken.cpu_seconds, outcome.final
-    speed = outcome.n_timesteps / max(taken, 1e-9)
-    text = (
-        f"{outcome.n_timesteps:,} steps in {taken:.1f} s of processor time ({speed:,.0f} steps/s)"
-    )
+    taken, final = outcome.progress.taken.cpu_seconds, outcome.final
+    n_steps = outcome.agent.num_timesteps
+    speed = n_steps / max(taken, 1e-9)
+    text = f"{n_steps:,} steps in {taken:.1f} s of processor time ({speed:,.0f} steps/s)"
     rows = [("trained", text)]
     if outcome.engine:
         rows.append(("engine", outcome.engine))
     if final is not None and final.others is not None:
         rows += [("beside", line) for line in describe_others(final.others)]
-    if outcome.best is not None:
+    if outcome.evaluation.best is not None:
         yardstick = None if final is None else final.yardstick
-        best = judged(outcome.best, yardstick, outcome.best_episodes)
-        rows.append(("best", APART.join([*best, f"at step {outcome.best_timesteps:,}"])))
+        best = judged(outcome.evaluation.best, yardstick, outcome.evaluation.best_episodes)
+        rows.append(("best", APART.join([*best, f"at step {outcome.evaluation.best_timesteps:,}"])))
     if final is not None:
-        tests = f"{outcome.evaluating.cpu_seconds:.1f} s of processor time"
-        share = outcome.evaluation_steps / max(outcome.n_timesteps, 1)
+        tests = f"{outcome.evaluation.taken.cpu_seconds:.1f} s of processor time"
+        share = outcome.evaluation_steps / max(n_steps, 1)
         played = f"{outcome.evaluation_steps:,} steps beside training ({share:.0%} of it)"
         how = played if outcome.evaluation_steps else "exact, no episodes sampled"
         rows.append(("tests", f"{how}; {tests}"))
@@ -448,7 +447,7 @@ def describe_pulls(pulls: PullSummary) -> str:
     )
 
 
-def next_commands(spec: TrainSpec, run: Run, outcome: Outcome) -> list[tuple[str, str]]:
+def next_commands(spec: TrainSpec, run: Run, outcome: Training) -> list[tuple[str, str]]:
     """Labels and commands, for the working directory of the training."""
     from rl_yardstick.pipeline.run import numbered_runs
     from rl_yardstick.pipeline.settings import entry_names

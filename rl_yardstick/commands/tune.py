@@ -198,7 +198,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
 def main() -> int:
     """Parse the arguments, search and re-test; return the exit code."""
     args = build_parser().parse_args()
-    from rl_yardstick.pipeline.modules import import_modules, split_id
+    from rl_yardstick.pipeline.components import import_modules, split_id
     from rl_yardstick.pipeline.run import Stop
 
     stop, deadline = Stop().listen(), time.monotonic() + args.timeout

@@ -28,7 +28,7 @@ from rl_yardstick.mdp import (
     state_visitation,
 )
 from rl_yardstick.mdp.transition_model import Floats, Ints
-from rl_yardstick.pipeline.arguments import constructor_parameters
+from rl_yardstick.pipeline.components import constructor_parameters
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
 from rl_yardstick.pipeline.evaluation.advice import share_of_standing_still
 from rl_yardstick.pipeline.evaluation.policies import is_network

@@ -26,8 +26,12 @@ from rl_yardstick.diagnosis.probe_worlds import (
     make_env,
 )
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.arguments import arguments_of, check_arguments, constructor_parameters
-from rl_yardstick.pipeline.components import constructor_arguments
+from rl_yardstick.pipeline.components import (
+    arguments_of,
+    check_arguments,
+    constructor_arguments,
+    constructor_parameters,
+)
 from rl_yardstick.pipeline.errors import UserError, one_line, unknown
 from rl_yardstick.pipeline.spec import validated
 

@@ -21,10 +21,10 @@ from rl_yardstick.experiments.pool import do_aside
 from rl_yardstick.experiments.results import StudyResults, values_over_seeds
 from rl_yardstick.experiments.study import COSTS, OF_TRAINING, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import FAILED, Yardstick
-from rl_yardstick.pipeline.modules import import_modules
 from rl_yardstick.verdicts import (
     UNBOUNDED,
     AgentRuns,

@@ -14,7 +14,7 @@ from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.results import StudyResults
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.arguments import arguments_of
+from rl_yardstick.pipeline.components import arguments_of
 from rl_yardstick.pipeline.files import plain
 from rl_yardstick.pipeline.settings import parse_assignments, shipped_hyperparams
 from rl_yardstick.pipeline.spec import TrainSpec

@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line
-from rl_yardstick.pipeline.modules import import_modules
 from rl_yardstick.pipeline.run import INTERRUPTED, LOCK, RUNNING, Run, Stop, resumable
 
 ERROR_FILE = "error.txt"  # the traceback of a run that failed

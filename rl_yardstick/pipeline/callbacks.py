@@ -1,19 +1,19 @@
-"""Callbacks of a training: evaluations, checkpoints, states, checks of numbers, pulls."""
+"""Callbacks of a training: evaluations, checkpoints, states, pulls, progress, time."""
 
 from __future__ import annotations
 
 import math
 import pickle
 import time
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3 import DQN
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.utils import ConstantSchedule
@@ -22,49 +22,38 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 from rl_yardstick.agents.bandits.runs import PullLog
 from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
 from rl_yardstick.machine_code import WorkTime
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import one_line
 from rl_yardstick.pipeline.evaluation.critics import CriticRecorder
 from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
 from rl_yardstick.pipeline.files import replacing
-from rl_yardstick.pipeline.finite_numbers import (
-    NotFiniteError,
-    check_model,
-    check_numbers,
-    check_rows,
-    is_finite,
-)
-from rl_yardstick.pipeline.run import LAST_PULLS, PULLS_FILE, Run
+from rl_yardstick.pipeline.finite_numbers import check_model
+from rl_yardstick.pipeline.run import LAST_PULLS, PULLS_FILE, Run, save_agent
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.pipeline.states import load_state, roots_of, save_state
 
 # --- checkpoints, and exploration that decays per update ------------------------------------------
 
 
-class StepCheckpoint(BlockCallback):
-    """Saves ``rl_model_<steps>_steps.zip`` every ``every_n_steps`` steps of all environments."""
+class Checkpoint(BlockCallback):
+    """Saves ``rl_model_<steps>_steps.zip`` every so many steps or episodes of all environments."""
 
-    def __init__(self, run: Run, every_n_steps: int, with_replay_buffer: bool = False) -> None:
+    def __init__(
+        self,
+        every_n_steps: int | None = None,
+        every_n_episodes: int = 0,
+        save_path: str = "",
+        with_replay_buffer: bool = False,
+    ) -> None:
         super().__init__()
-        self.run, self.every_n_steps = run, every_n_steps
-        self.with_replay_buffer = with_replay_buffer
-
-    def _on_step(self) -> bool:
-        save_checkpoint(self.run, self.model, self.with_replay_buffer)
-        return True
-
-
-class EpisodeCheckpoint(BlockCallback):
-    """Saves a checkpoint every ``every_n_episodes`` episodes of all environments."""
-
-    def __init__(self, run: Run, every_n_episodes: int, with_replay_buffer: bool = False) -> None:
-        super().__init__()
-        self.run, self.every_n_episodes = run, every_n_episodes
-        self.with_replay_buffer = with_replay_buffer
+        self.every_n_steps, self.every_n_episodes = every_n_steps, every_n_episodes
+        self.folder, self.with_replay_buffer = Path(save_path), with_replay_buffer
         self.episodes_seen = 0
 
     def horizon(self) -> Horizon:
+        if self.every_n_steps is not None:
+            return super().horizon()
         return Horizon(episodes=calls_until_multiple(self.episodes_seen, self.every_n_episodes))
 
     def pass_over(self, n_calls: int, n_episodes: int) -> None:
@@ -72,50 +61,33 @@ class EpisodeCheckpoint(BlockCallback):
         self.episodes_seen += n_episodes
 
     def _on_step(self) -> bool:
-        before = self.episodes_seen
-        self.episodes_seen += int(np.sum(self.locals["dones"]))
-        if self.episodes_seen // self.every_n_episodes > before // self.every_n_episodes:
-            save_checkpoint(self.run, self.model, self.with_replay_buffer)
+        if self.every_n_steps is None:
+            before = self.episodes_seen
+            self.episodes_seen += int(np.sum(self.locals["dones"]))
+            if self.episodes_seen // self.every_n_episodes == before // self.every_n_episodes:
+                return True
+        model: Any = self.model
+        save_agent(model, self.folder / f"rl_model_{model.num_timesteps}_steps.zip")
+        if self.with_replay_buffer and getattr(model, "replay_buffer", None) is not None:
+            name = f"rl_model_replay_buffer_{model.num_timesteps}_steps.pkl"
+            with replacing(self.folder / name) as beside:
+                model.save_replay_buffer(beside)
         return True
 
 
-def save_checkpoint(run: Run, model: Any, with_replay_buffer: bool) -> None:
-    """Save the current agent, its statistics, and its replay buffer, if that is asked for."""
-    steps = model.num_timesteps
-    run.save(model, run.path / f"rl_model_{steps}_steps.zip")
-    if with_replay_buffer and getattr(model, "replay_buffer", None) is not None:
-        with replacing(run.path / f"rl_model_replay_buffer_{steps}_steps.pkl") as beside:
-            model.save_replay_buffer(beside)
-
-
 class ExponentialExploration(BaseCallback):
-    """Multiplies DQN's epsilon by a constant factor at each gradient update.
-
-    Args:
-        initial_eps: epsilon before the first update; all arguments are in [0, 1].
-        final_eps: the lower bound of epsilon.
-        decay: the factor.
-    """
+    """Multiplies DQN's epsilon by ``decay`` at each gradient update; all arguments in [0, 1]."""
 
     def __init__(
         self, initial_eps: float = 1.0, final_eps: float = 0.01, decay: float = 0.995
     ) -> None:
         super().__init__()
         self.initial_eps, self.final_eps, self.decay = initial_eps, final_eps, decay
-        for name in ("initial_eps", "final_eps", "decay"):
-            if not 0 <= (value := getattr(self, name)) <= 1:
-                raise ValueError(f"{name} must lie between 0 and 1, not {value}")
-
-    def _init_callback(self) -> None:
-        if not isinstance(self.model, DQN):
-            name = type(self.model).__name__
-            raise UserError(f"ExponentialExploration is for DQN and subclasses, not for {name}")
 
     def _on_rollout_start(self) -> None:
-        updates = self.model._n_updates
-        epsilon = max(self.final_eps, self.initial_eps * self.decay**updates)
-        # The algorithm reads its schedule after each step: it must equal the current rate.
         model: Any = self.model
+        epsilon = max(self.final_eps, self.initial_eps * self.decay**model._n_updates)
+        # The algorithm reads its schedule after each step: it must equal the current rate.
         model.exploration_schedule = ConstantSchedule(epsilon)
         model.exploration_rate = epsilon
 
@@ -123,7 +95,7 @@ class ExponentialExploration(BaseCallback):
         return True
 
 
-# --- states ---------------------------------------------------------------------------------------
+# --- states, time and progress --------------------------------------------------------------------
 
 
 class StateCallback(BlockCallback):
@@ -132,49 +104,43 @@ class StateCallback(BlockCallback):
     Both happen at a safe moment: after the last update and before the next step. At the first one
     of a resumed run, the saved state is put back.
 
-    Attributes:
-        others: the other callbacks, whose state is saved too.
-        share_of_time: the share of the time that saving may take.
-        shortest_pause: seconds between two states.
+    The state includes that of the ``others``.
     """
 
     takes_blocks = True
-    share_of_time, shortest_pause = 0.02, 1.0
+    share_of_time = 0.02  # that saving may take
+    shortest_pause = 1.0  # seconds between two states
 
-    def __init__(self, run: Run, resumes: bool, clock: Any, judge: Judge) -> None:
+    def __init__(
+        self, run: Run, resumes: bool, judge: Judge, others: list[BaseCallback], clock: Any
+    ) -> None:
         super().__init__()
-        self.run, self.resumes, self.clock = run, resumes, clock
-        self.evaluator = judge.evaluator
+        self.run, self.resumes, self.others, self.clock = run, resumes, others, clock
         self.process = {"run": run, "exact": judge.exact, "eval_env": judge.env}
+        self.evaluator = {} if judge.exact is not None else {"evaluator": judge.evaluator}
         self.is_possible = True
-        self.others: list[BaseCallback] = []
-        self.saved_at, self.pause = time.monotonic(), self.shortest_pause
+        self.due_at = time.monotonic() + self.shortest_pause
 
     def wants_position(self) -> bool:
-        return self.resumes or self._is_due() or bool(self.run.stop.number)
-
-    def _is_due(self) -> bool:
-        return self.is_possible and time.monotonic() - self.saved_at >= self.pause
-
-    def _roots(self) -> dict[str, Any]:
-        roots = roots_of(self.model, self.others, **self.process)
-        is_exact = self.evaluator is self.process["exact"]  # which has no state of its own
-        return roots if is_exact else {**roots, "evaluator": self.evaluator}
+        is_due = self.is_possible and time.monotonic() >= self.due_at
+        return self.resumes or is_due or bool(self.run.stop.number)
 
     def _on_rollout_start(self) -> None:
         if self.resumes:
             load_state(self.run.state_path, self._roots())
             self.resumes = False
             self.run.console.print(f"resuming at step {self.model.num_timesteps:,}")
-        elif self._is_due() or (self.is_possible and self.run.stop.number):
-            self.save()
+        elif self.is_possible and self.wants_position():
+            self._save()
         self.run.has_begun = True
         self.run.stop.check()
 
-    def save(self) -> None:
-        """Save the state; called between two updates."""
+    def _roots(self) -> dict[str, Any]:
+        return roots_of(self.model, self.others, **self.process, **self.evaluator)
+
+    def _save(self) -> None:
         begun = time.monotonic()
-        self.clock.stop()
+        self.clock.read_clock()
         try:
             save_state(self.run.state_path, self._roots(), ("logger", *self.process))
         except (TypeError, AttributeError, ValueError, pickle.PicklingError) as error:
@@ -182,65 +148,68 @@ class StateCallback(BlockCallback):
             self.run.console.print(
                 f"no state can be saved, so the training cannot be resumed: {one_line(error)}"
             )
-        self.saved_at = time.monotonic()
-        self.pause = max((self.saved_at - begun) / self.share_of_time, self.shortest_pause)
+        now = time.monotonic()
+        self.due_at = now + max((now - begun) / self.share_of_time, self.shortest_pause)
 
     def _on_step(self) -> bool:
         return True
 
 
-# --- numbers that are not finite end a training ---------------------------------------------------
-
-# Log entries of the library's agents. Others may be nan, as the explained variance of constants.
-_LOSSES = tuple(
-    f"train/{name}" for name in ("loss", "actor_loss", "critic_loss", "ent_coef_loss", "value_loss")
-)
-_NO_EPISODE: Mapping[str, float] = {"r": 0.0}
+UPDATES = 400  # of a training's bar
+SECONDS_BETWEEN_LINES = 10.0
 
 
-class NumberWatch(BlockCallback):
-    """Checks the numbers of each step (or of a compiled block's last step) and the losses."""
+class ProgressCallback(BlockCallback):
+    """Tells the steps and the mean return of training's last episodes, and takes the time.
 
-    takes_blocks = True
+    Attributes:
+        taken: the time of training over all its starts, without compiling.
+    """
 
-    def update_locals(self, locals_: dict[str, Any]) -> None:
-        """Keep the training loop's variables without a copy, because this runs at each step."""
-        self.locals = locals_
+    excluded_from_states = ("console", "bar", "task", "told_at", "_begun", "_compiling")
+
+    def __init__(self, console: Console, n_timesteps: int, on_variant: bool = False) -> None:
+        super().__init__()
+        self.console, self.taken = console, WorkTime()
+        self.where = "training (on a variant)" if on_variant else "training"
+        # A block of compiled training ends where a callback acts: nobody reads a quiet console.
+        few = min(max(n_timesteps // UPDATES, 1), 20_000)
+        self.every_n_steps = max(n_timesteps, 1) if console.quiet else few
+        columns = BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+        text, is_live = TextColumn("{task.description}"), console.is_terminal and not console.quiet
+        self.bar = Progress(*columns, text, console=console, transient=True, disable=not is_live)
+        self.task = self.bar.add_task("", total=1.0)
+        self.told_at = time.monotonic()
+
+    def start_clock(self, time_compiling: Callable[[], WorkTime]) -> None:
+        """Begin to count the time."""
+        self._begun, self._compiling = WorkTime.now() - time_compiling(), time_compiling
+
+    def read_clock(self) -> None:
+        """Add the time since the start, and go on counting from here."""
+        now = WorkTime.now() - self._compiling()
+        self.taken, self._begun = self.taken + (now - self._begun), now
 
     def _on_training_start(self) -> None:
-        if self.model._last_obs is not None:
-            when = f"at step {self.model.num_timesteps:,}"
-            check_rows(self.model._last_obs, "observation", when)
-
-    def _on_rollout_start(self) -> None:
-        log = self.model.logger.name_to_value
-        for name in _LOSSES:
-            if name in log and not isfinite(log[name]):
-                raise NotFiniteError(f"{name} at step {self.model.num_timesteps:,}", log[name])
+        self.told_at = time.monotonic()
+        self.bar.start()
 
     def _on_step(self) -> bool:
-        seen = self.locals
-        # Algorithms that play whole episodes, such as ARS, pass other variables.
-        new_obs = seen.get("new_obs", seen.get("new_observations"))
-        rewards, actions = seen.get("rewards"), seen.get("actions")
-        if not (is_finite(rewards) and is_finite(new_obs) and is_finite(actions)):
-            when = f"at step {self.num_timesteps:,}"
-            check_rows(rewards, "reward", when)
-            check_rows(new_obs, "observation", when)
-            check_rows(actions, "action", when)
-        dones = seen.get("dones")
-        if dones is None or True not in (ended := dones.tolist()):
+        share = min(self.num_timesteps / max(self.model._total_timesteps, 1), 1.0)
+        if self.bar.disable and time.monotonic() - self.told_at <= SECONDS_BETWEEN_LINES:
             return True
-        # Observations before resets, and the returns in Monitor's records.
-        for i, info in enumerate(seen["infos"]):
-            if not ended[i]:
-                continue
-            last, total = info.get("terminal_observation"), info.get("episode", _NO_EPISODE)["r"]
-            if not (is_finite(last) and isfinite(total)):
-                where = f"of an episode of environment {i} at step {self.num_timesteps:,}"
-                check_numbers(last, "last observation", where)
-                check_numbers(total, "return", where)
+        figures = f"{self.num_timesteps:,} steps"
+        if episodes := self.model.ep_info_buffer:
+            mean = np.mean([episode["r"] for episode in episodes])
+            figures += f"  mean return in {self.where} {mean:.2f}"
+        self.bar.update(self.task, completed=share, description=figures)
+        if self.bar.disable:
+            self.told_at = time.monotonic()
+            self.console.print(f"{share:4.0%}  {figures}", highlight=False)
         return True
+
+    def _on_training_end(self) -> None:
+        self.bar.stop()  # gives the terminal back; may be called repeatedly
 
 
 # --- the pulls of a training on a bandit ----------------------------------------------------------
@@ -259,19 +228,6 @@ class PullSummary:
     optimal: float | None  #: share of best arms among the last pulls; None as for ``regret``
 
 
-def summarise_pulls(pulls: Mapping[str, NDArray[Any]]) -> PullSummary:
-    """Compute the summary from the arrays of `PullLog.arrays`."""
-    regrets, matched = pulls["regrets"], pulls["matched"]
-    is_known = not bool(np.isnan(regrets).any())
-    return PullSummary(
-        n_pulls=int(regrets.size),
-        n_matched=int(matched.sum()),
-        reward=float(pulls["rewards"][matched].mean(dtype=np.float64)) if matched.any() else None,
-        regret=float(regrets.sum()) if is_known else None,
-        optimal=float(pulls["optimal"][:, -LAST_PULLS:].mean()) if is_known else None,
-    )
-
-
 class PullRecorder(PullLog):
     """Writes ``pulls.npz`` at the end of training, with the contents of `PullLog.arrays`."""
 
@@ -282,6 +238,19 @@ class PullRecorder(PullLog):
     def _on_training_end(self) -> None:
         with replacing(self.folder / PULLS_FILE) as beside:
             np.savez(beside, allow_pickle=False, **self.arrays())
+
+    def summary(self) -> PullSummary:
+        """The summary of all pulls."""
+        pulls = self.arrays()
+        regrets, matched = pulls["regrets"], pulls["matched"]
+        is_known, rewards = not bool(np.isnan(regrets).any()), pulls["rewards"][matched]
+        return PullSummary(
+            n_pulls=int(regrets.size),
+            n_matched=int(matched.sum()),
+            reward=float(rewards.mean(dtype=np.float64)) if rewards.size else None,
+            regret=float(regrets.sum()) if is_known else None,
+            optimal=float(pulls["optimal"][:, -LAST_PULLS:].mean()) if is_known else None,
+        )
 
 
 # --- evaluations during training: when they are due, and what they leave --------------------------
@@ -296,11 +265,9 @@ class EvaluationCallback(EvalCallback):
     Attributes:
         eval_freq: calls of ``VecEnv.step`` between two evaluations; 0 for none.
         eval_episode_freq: episodes between two evaluations, likewise.
-        taken: the time of all evaluations.
-        n_episodes: of each evaluation; 0 if it is exact.
     """
 
-    excluded_from_states = ("eval_env", "taken")
+    excluded_from_states = ("eval_env", "taken", "_written_at")
 
     def __init__(
         self,
@@ -313,12 +280,13 @@ class EvaluationCallback(EvalCallback):
     ) -> None:
         super().__init__(eval_env, eval_freq=frequencies[0], verbose=0)
         self.eval_episode_freq = frequencies[1]
+        self.is_asked_for = max(frequencies) > 0
         self.run, self.evaluator = run, evaluator
         self.value_maps, self.critics = value_maps, critics
-        self.episodes_seen = 0
-        self.best_timesteps = self.best_episodes = 0
-        self.taken = WorkTime()
-        self.n_episodes: list[int] = []
+        self.best: float | None = None  # mean return of all evaluations
+        self.episodes_seen = self.best_timesteps = self.best_episodes = 0
+        self.taken = WorkTime()  # by all evaluations
+        self.n_episodes: list[int] = []  # of each evaluation; 0 if it is exact
         self._written_at = -math.inf
 
     def horizon(self) -> Horizon:
@@ -332,16 +300,6 @@ class EvaluationCallback(EvalCallback):
         """Count skipped calls."""
         self.n_calls += n_calls
         self.episodes_seen += n_episodes
-
-    @property
-    def is_asked_for(self) -> bool:
-        """Whether there are evaluations during training."""
-        return self.eval_freq > 0 or self.eval_episode_freq > 0
-
-    @property
-    def best(self) -> float | None:
-        """The best mean return of all evaluations in training."""
-        return self.best_mean_reward if self.best_timesteps else None
 
     def _init_callback(self) -> None:
         """Skip the library's check that training and evaluation environments have one type."""
@@ -374,17 +332,24 @@ class EvaluationCallback(EvalCallback):
             self.evaluations_successes.append(found.successes.tolist())
         self.n_episodes.append(0 if found.is_exact else len(found.returns))
         # Replacing a file takes longer than an exact evaluation.
-        if not 0 <= time.monotonic() - self._written_at < SECONDS_BETWEEN_WRITES:
+        if time.monotonic() - self._written_at >= SECONDS_BETWEEN_WRITES:
             self.write()
         if self.value_maps is not None:
             self.value_maps.count(self.model)
         if self.critics is not None:
             self.critics.judge(self.num_timesteps)
-        self._log(found)
+        scale, mean = found.yardstick, found.mean_return
+        logged = {"mean_reward": mean, "mean_ep_length": float(found.lengths.mean())}
+        logged |= {} if found.success_rate is None else {"success_rate": found.success_rate}
+        logged |= {} if scale is None else {"gap": scale.gap(mean), "score": scale.score(mean)}
+        for name, value in logged.items():
+            self.logger.record(f"eval/{name}", value)
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
         if found.mean_return > self.best_mean_reward:
-            self.best_mean_reward = found.mean_return
+            self.best = self.best_mean_reward = found.mean_return
             self.best_timesteps, self.best_episodes = self.num_timesteps, self.n_episodes[-1]
-            self.run.save(self.model, self.run.best_model_path)
+            save_agent(self.model, self.run.best_model_path)
         return self._on_event() if self.callback is not None else True
 
     def take_statistics(self) -> None:
@@ -396,36 +361,24 @@ class EvaluationCallback(EvalCallback):
         """Write ``evaluations.npz``."""
         if not self.evaluations_timesteps:
             return
+
+        def table(rows: list[list[Any]]) -> NDArray[Any]:
+            # Shorter rows are repeated; rl_zoo3's plots need at least two columns.
+            width = max(math.lcm(*map(len, rows)), 2)
+            return np.array([row * (width // len(row)) for row in rows])
+
         arrays: dict[str, Any] = {
             "timesteps": self.evaluations_timesteps,
-            "results": _table(self.evaluations_results),
-            "ep_lengths": _table(self.evaluations_length),
+            "results": table(self.evaluations_results),
+            "ep_lengths": table(self.evaluations_length),
         }
         if self.evaluations_successes:
-            arrays["successes"] = _table(self.evaluations_successes)
+            arrays["successes"] = table(self.evaluations_successes)
         if len(set(self.n_episodes)) > 1:
             arrays["n_episodes"] = self.n_episodes
         with replacing(self.run.path / "evaluations.npz") as beside:
             np.savez(beside, **arrays)
         self._written_at = time.monotonic()
-
-    def _log(self, found: Evaluation) -> None:
-        record = self.logger.record
-        record("eval/mean_reward", found.mean_return)
-        record("eval/mean_ep_length", float(found.lengths.mean()))
-        if found.success_rate is not None:
-            record("eval/success_rate", found.success_rate)
-        if found.yardstick is not None:
-            record("eval/gap", found.yardstick.gap(found.mean_return))
-            record("eval/score", found.yardstick.score(found.mean_return))
-        record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(self.num_timesteps)
-
-
-def _table(rows: list[list[Any]]) -> NDArray[Any]:
-    """Rows as one array, shorter rows repeated; rl_zoo3's plots need at least two columns."""
-    width = max(math.lcm(*map(len, rows)), 2)
-    return np.array([row * (width // len(row)) for row in rows])
 
 
 def evaluation_frequencies(

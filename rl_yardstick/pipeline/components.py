@@ -1,19 +1,31 @@
-"""Classes, schedules and other objects that plain values in hyperparameters stand for.
+"""What stands in hyperparameters: arguments of constructors, and names that become objects.
 
 A name in a file can choose a class of a fixed kind from a fixed set of packages; it cannot import
-or call anything else.
+or call anything else. Modules of the user are imported because their names were typed.
+
+Importing an agent takes two seconds, for torch. So the signatures of the registered agents stand in
+``hyperparams/arguments.json``, which a test compares with the classes; after a change run
+``python -m rl_yardstick.pipeline.components``. Agents that are not in it are imported.
 """
 
 from __future__ import annotations
 
 import importlib
 import inspect
+import json
+import math
 import re
+import sys
+import traceback
+import typing
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 from rl_yardstick.pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
-from rl_yardstick.pipeline.modules import module_name
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
 # Names in files are looked up in these packages, and in modules that the user typed. Importing
@@ -22,26 +34,84 @@ PACKAGES = (
     *("rl_yardstick", "stable_baselines3", "sb3_contrib", "gymnasium", "torch.nn", "torch.optim"),
     *("rl_zoo3.wrappers", "rl_zoo3.callbacks"),
 )
-_SHORT = {"nn": "torch.nn", "th": "torch", "sb3": "stable_baselines3", "gym": "gymnasium"}
-_SHORT |= {"optim": "torch.optim"}
+_SHORT = {"nn": "torch.nn", "th": "torch", "optim": "torch.optim"}
+_SHORT |= {"sb3": "stable_baselines3", "gym": "gymnasium"}
 _CLASSES = {
     "RMSpropTFLike": "stable_baselines3.common.sb2_compat.rmsprop_tf_like.RMSpropTFLike",
     "HerReplayBuffer": "stable_baselines3.her.her_replay_buffer.HerReplayBuffer",
 }
 _PLACES = re.compile(r"(path|dir|folder|file|filename|log|prefix)$")
+_DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")
+
+
+# --- modules of the user --------------------------------------------------------------------------
+
+
+def import_modules(typed: Iterable[str]) -> None:
+    """Import modules by name or by file; the current folder comes first, as with ``python -m``.
+
+    Without any name the current folder is not searched: it may be a stranger's.
+    """
+    for name in typed:
+        if str(Path.cwd()) not in sys.path[:1]:
+            sys.path.insert(0, str(Path.cwd()))
+        try:
+            if name.endswith(".py") or "/" in name:
+                _import_file(Path(name).expanduser())
+            else:
+                importlib.import_module(name)
+        except UserError:
+            raise
+        except ModuleNotFoundError as error:
+            raise UserError(f"--gym-packages {name}: no module named {error.name}") from error
+        except (Exception, SystemExit) as error:  # an import may raise anything
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{last.filename}:{last.lineno}"
+            raise UserError(f"--gym-packages {name}: {place}: {one_line(error)}") from error
+
+
+def _import_file(path: Path) -> None:
+    file = path / "__init__.py" if path.is_dir() else path
+    if not file.is_file():
+        raise UserError(f"--gym-packages {path}: no such file")
+    module = file.parent if file.name == "__init__.py" else file.with_suffix("")
+    loaded = sys.modules.get(module.name)
+    if loaded is None:
+        sys.path.insert(0, str(module.parent.resolve()))  # what lies beside it can be imported too
+        importlib.import_module(module.name)
+    elif Path(getattr(loaded, "__file__", None) or "").resolve() != file.resolve():
+        fault = f"another module is named {module.name}; rename it"
+        raise UserError(f"--gym-packages {path}: {fault}")
+
+
+def module_name(typed: str) -> str:
+    """The name under which `import_modules` has imported what was typed."""
+    return Path(typed).stem if typed.endswith(".py") or "/" in typed else typed
+
+
+def split_id(env_id: str) -> tuple[str, str]:
+    """The module and the id in ``module:Env-v0``, Gymnasium's form; an empty module without it."""
+    module, _, name = env_id.rpartition(":")
+    return module, name
+
+
+def check_typed(recorded: Iterable[str], typed: Iterable[str], where: str) -> None:
+    """Raise UserError if a module that a file names is missing among those that were typed."""
+    known = {module_name(name) for name in typed}
+    missing = [name for name in recorded if module_name(name) not in known]
+    if missing:
+        what = f"was made with modules of yours: add --gym-packages {' '.join(missing)}"
+        raise UserError(f"{where} {what}")
+
+
+# --- classes, and what they are built from --------------------------------------------------------
 
 
 def find_class(name: str, bases: tuple[type, ...], where: str, typed: list[str]) -> type:
-    """The class of a dotted name, if it is a subclass of one of ``bases``.
+    """The class of a dotted name such as ``nn.Tanh``, if it is a subclass of one of ``bases``.
 
-    Args:
-        name: such as ``nn.Tanh``.
-        bases: the kinds that are admitted.
-        where: begins every message.
-        typed: modules of the user, where names are looked up too.
-
-    Raises:
-        UserError: if the name is not admitted, or there is no such class.
+    Names are looked up in the ``typed`` modules of the user too. Raises UserError if the name is
+    not admitted, or there is no such class.
     """
     first, dot, rest = _CLASSES.get(name, name).partition(".")
     module, _, cls = f"{_SHORT.get(first, first)}{dot}{rest}".rpartition(".")
@@ -58,18 +128,12 @@ def find_class(name: str, bases: tuple[type, ...], where: str, typed: list[str])
         return found
     wanted = " or ".join(base.__name__ for base in bases)
     known = [n for n, c in vars(inside).items() if isinstance(c, type) and issubclass(c, bases)]
-    fault = "does not exist" if found is None else f"is no {wanted}"
-    hint = did_you_mean(cls, known)
+    fault, hint = "does not exist" if found is None else f"is no {wanted}", did_you_mean(cls, known)
     raise UserError(f"{where}: {name} {fault}{': ' + hint if hint else ''}")
 
 
 def build(
-    component: Component,
-    base: type,
-    where: str,
-    typed: list[str],
-    folder: Path | None,
-    *inner: Any,
+    component: Component, base: type, where: str, typed: list[str], folder: Path | None, *inner: Any
 ) -> Any:
     """An object of a wrapper or callback, around ``inner``; it may write into ``folder`` alone."""
     from gymnasium.error import Error
@@ -92,14 +156,12 @@ def _inside(name: str, value: Any, folder: Path | None, where: str) -> Any:
     """A path among the arguments, inside the run folder."""
     if not (isinstance(value, str) and _PLACES.search(name)) or folder is None:
         return value
-    if name.endswith("prefix"):
-        if Path(value).name != value:
-            raise UserError(f"{where}: {name} begins the names of files, unlike {shown(value)}")
-        return value
-    path = (folder / value).resolve()
+    path, is_prefix = (folder / value).resolve(), name.endswith("prefix")
+    if is_prefix and Path(value).name != value:
+        raise UserError(f"{where}: {name} begins the names of files, unlike {shown(value)}")
     if not path.is_relative_to(folder.resolve()):
         raise UserError(f"{where}: {name} must lie inside the run folder, unlike {shown(value)}")
-    return str(path)
+    return value if is_prefix else str(path)
 
 
 def build_value(value: Any, where: str, typed: list[str]) -> Any:
@@ -108,13 +170,46 @@ def build_value(value: Any, where: str, typed: list[str]) -> Any:
         return {key: build_value(item, f"{where}: {key}", typed) for key, item in value.items()}
     if isinstance(value, list):
         return [build_value(item, where, typed) for item in value]
-    is_name = isinstance(value, str) and re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+", value)
-    if is_name or value in _CLASSES.values() or (isinstance(value, str) and value in _CLASSES):
-        from stable_baselines3.common.buffers import BaseBuffer
-        from torch import nn, optim
+    if not isinstance(value, str) or (value not in _CLASSES and not _DOTTED.fullmatch(value)):
+        return value
+    from stable_baselines3.common.buffers import BaseBuffer
+    from torch import nn, optim
 
-        return find_class(str(value), (nn.Module, optim.Optimizer, BaseBuffer), where, typed)
-    return value
+    return find_class(value, (nn.Module, optim.Optimizer, BaseBuffer), where, typed)
+
+
+# --- the arguments of an agent --------------------------------------------------------------------
+
+
+def constructor_arguments(spec: TrainSpec, algorithm: Any, is_dict: bool) -> dict[str, Any]:
+    """The arguments of an agent's constructor, with objects in place of texts that name them.
+
+    ``is_dict``: whether observations are dictionaries, which decides the default policy.
+    """
+    from stable_baselines3.common.policies import BasePolicy
+
+    from rl_yardstick.agents.common.model_files import JsonAlgorithm
+
+    for_library, kinds = not issubclass(algorithm, JsonAlgorithm), arguments_of(spec.algo)
+    policies = list(getattr(algorithm, "policy_aliases", {}))
+    found: dict[str, Any] = {}
+    for key, value in spec.algorithm.items():
+        where, text = f"{spec.algo}: {key}", str(value)
+        if text.startswith(("lin_", "exp_")) and "str" not in kinds[key]:
+            found[key] = schedule(text, for_library)
+        elif key == "train_freq" and isinstance(value, list):
+            found[key] = tuple(value)
+        elif key == "policy" and "." in text:
+            found[key] = find_class(text, (BasePolicy,), where, spec.gym_packages)
+        elif key == "policy" and policies and value not in policies:
+            raise unknown(f"{spec.algo}: unknown policy", text, policies)
+        else:
+            found[key] = build_value(value, where, spec.gym_packages)
+    if "policy" in kinds and "policy" not in found:
+        prefix = "MultiInput" if is_dict else "Mlp"
+        fitting = [name for name in policies if name.startswith(prefix)]
+        found["policy"] = [*fitting, *policies, f"{prefix}Policy"][0]
+    return found
 
 
 def schedule(text: str, for_library: bool) -> Any:
@@ -133,58 +228,9 @@ def schedule(text: str, for_library: bool) -> Any:
             return LinearSchedule(start, end, 1.0)
         found = ExponentialSchedule(start, end)
     except ValueError as error:
-        reason = one_line(error)
-        raise UserError(f"{text} is no schedule such as lin_0.001 or exp_0.5_0.01: {reason}") from (
-            error
-        )
+        fault = f"{text} is no schedule such as lin_0.001 or exp_0.5_0.01: {one_line(error)}"
+        raise UserError(fault) from error
     return library_schedule(found) if for_library else found
-
-
-def constructor_arguments(spec: TrainSpec, algorithm: type, is_dict: bool) -> dict[str, Any]:
-    """The arguments of an agent's constructor, with objects in place of texts that name them.
-
-    Args:
-        spec: the training.
-        algorithm: the agent's class.
-        is_dict: whether observations are dictionaries, which decides the default policy.
-    """
-    from rl_yardstick.agents.common.model_files import JsonAlgorithm
-    from rl_yardstick.pipeline.arguments import arguments_of
-
-    for_library, kinds = not issubclass(algorithm, JsonAlgorithm), arguments_of(spec.algo)
-    found: dict[str, Any] = {}
-    for key, value in spec.algorithm.items():
-        where = f"{spec.algo}: {key}"
-        if (
-            isinstance(value, str)
-            and value.startswith(("lin_", "exp_"))
-            and "str" not in kinds[key]
-        ):
-            found[key] = schedule(value, for_library)
-        elif key == "train_freq" and isinstance(value, list):
-            found[key] = tuple(value)
-        elif key == "policy":
-            found[key] = _policy(spec, algorithm, value)
-        else:
-            found[key] = build_value(value, where, spec.gym_packages)
-    if "policy" in kinds and "policy" not in found:
-        prefix = "MultiInput" if is_dict else "Mlp"
-        known: list[str] = [*getattr(algorithm, "policy_aliases", {})]
-        fitting = (name for name in known if name.startswith(prefix))
-        found["policy"] = next(fitting, next(iter(known), f"{prefix}Policy"))
-    return found
-
-
-def _policy(spec: TrainSpec, algorithm: Any, name: Any) -> Any:
-    """The policy's name, or its class."""
-    from stable_baselines3.common.policies import BasePolicy
-
-    where, known = f"{spec.algo}: policy", algorithm.policy_aliases
-    if "." in str(name):
-        return find_class(str(name), (BasePolicy,), where, spec.gym_packages)
-    if known and name not in known:
-        raise unknown(f"{spec.algo}: unknown policy", str(name), known)
-    return name
 
 
 def action_noise(spec: TrainSpec, actions: Any) -> dict[str, Any]:
@@ -197,3 +243,155 @@ def action_noise(spec: TrainSpec, actions: Any) -> dict[str, Any]:
     kinds = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
     mean = np.zeros(actions.shape or ())
     return {"action_noise": kinds[spec.noise_type](mean, np.full_like(mean, spec.noise_std))}
+
+
+# --- signatures, and the check of values against them ---------------------------------------------
+
+TABLE = Path(__file__).parents[1] / "hyperparams" / "arguments.json"
+
+# Arguments that a flag or another key sets.
+_SET_ELSEWHERE = {"env", "seed", "device", "verbose", "tensorboard_log", "action_noise"}
+_INTERNAL = {"self", "_init_setup_model", "venv", "filename"}
+_PLAIN = {"bool": bool, "int": int, "float": float, "str": str, "dict": dict, "list": list}
+_WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a text"}
+_WORDS |= {"schedule": "a schedule such as lin_0.001", "dict": "a mapping", "list": "a list"}
+_WORDS |= {"None": "none"}
+
+# Ranges that hold for every agent; an agent's own checks come when it is made.
+_SHARE, _COUNT, _POSITIVE = Field(ge=0, le=1), Field(ge=1, le=2**62), Field(ge=0)
+_RANGES = {
+    "gamma gae_lambda tau": _SHARE,
+    "exploration_fraction exploration_initial_eps exploration_final_eps": _SHARE,
+    "n_steps batch_size n_epochs buffer_size train_freq": _COUNT,
+    "target_update_interval stats_window_size": _COUNT,
+    "learning_starts temperature vf_coef target_kl clip_range": _POSITIVE,
+    "clip_range_vf rms_prop_eps max_grad_norm": _POSITIVE,
+    "gradient_steps sde_sample_freq": Field(ge=-1),  # -1: each step, never
+    # Larger rates overflow single precision in the first update.
+    "learning_rate": Field(ge=0, le=1e37),
+}
+_RANGE_OF: dict[str, Any] = {name: r for names, r in _RANGES.items() for name in names.split()}
+AUTO = ("gamma", "learning_rate", "initial_q", "value_bound")  # which may be ``auto``
+# Keys of an entry that hold arguments of a class of the library's.
+WRAPPERS = {
+    "normalize": "stable_baselines3.common.vec_env:VecNormalize",
+    "monitor_kwargs": "stable_baselines3.common.monitor:Monitor",
+}
+
+
+@cache
+def _table() -> dict[str, dict[str, list[str]]]:
+    return json.loads(TABLE.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
+
+
+def arguments_of(algo: str) -> dict[str, list[str]]:
+    """The arguments that hyperparameters may set: names, and the kinds of value each takes."""
+    return _table()[algo] if algo in _table() else read_signature(algo)
+
+
+def known_names() -> set[str]:
+    """The arguments of all registered agents."""
+    return {name for algo in _table().keys() - WRAPPERS for name in _table()[algo]}
+
+
+def read_signature(name: str) -> dict[str, list[str]]:
+    """Import the class of an agent, or of a key of `WRAPPERS`, and read its signature."""
+    from rl_yardstick.agents import load_algorithm
+
+    module, _, cls = WRAPPERS.get(name, "").partition(":")
+    found = constructor_parameters(
+        getattr(importlib.import_module(module), cls) if module else load_algorithm(name)
+    )
+    kinds = {name: sorted(_kinds(p.annotation, p.default)) for name, p in found.items()}
+    return {name: kinds[name] for name in kinds if name not in _SET_ELSEWHERE | _INTERNAL}
+
+
+def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
+    """The arguments of a constructor, with those that ``**kwargs`` passes to base classes."""
+    try:
+        signature = inspect.signature(cls, eval_str=True)
+    except (NameError, TypeError, AttributeError):  # some annotations are for type checkers alone
+        signature = inspect.signature(cls)
+    parameters = signature.parameters.values()
+    named = {p.name: p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    owners = [base for base in cls.__mro__[:-1] if "__init__" in vars(base)]
+    if any(p.kind is p.VAR_KEYWORD for p in parameters) and len(owners) > 1:
+        inherited = constructor_parameters(owners[1])
+        if "env" in named and "policy" not in named:
+            inherited.pop("policy", None)  # the constructor passes it itself
+        named = {**inherited, **named}
+    return named
+
+
+def _kinds(annotation: Any, default: Any = None) -> set[str]:
+    """The kinds of plain value that an annotation admits; ``any`` for classes and the unknown."""
+    if annotation in (None, type(None)):
+        return {"None"}
+    if annotation is inspect.Parameter.empty and type(default) in (int, float):
+        annotation = type(default)
+    origin, members = typing.get_origin(annotation), typing.get_args(annotation)
+    name = getattr(origin or annotation, "__name__", "")
+    if name in _PLAIN:
+        return {name}
+    if origin is Literal:
+        return {f"={word}" for word in members}
+    if origin is Sequence:
+        return {"list"}
+    if Callable in (annotation, origin):
+        return {"schedule"}
+    if members and origin not in (type, tuple):
+        return set().union(*map(_kinds, members))
+    return {"any"}
+
+
+def check_arguments(owner: str, values: Any, where: str = "") -> dict[str, Any]:
+    """The values of constructor arguments, each of its type (``"1e-4"`` becomes a number).
+
+    ``owner`` is an agent, or a key of `WRAPPERS`; ``where`` begins every message. Raises UserError
+    for an argument that does not exist, or a value that is not of its type or range.
+    """
+    if not isinstance(values, dict):
+        raise UserError(f"{owner} must be a mapping, not {shown(values)}")
+    known = arguments_of(owner)
+    for name in values:
+        if name not in known:
+            raise unknown(f"{where}unknown argument", str(name), known)
+    return {name: _checked(f"{where}{name}", value, known[name]) for name, value in values.items()}
+
+
+def _checked(name: str, value: Any, kinds: list[str]) -> Any:
+    """The value, converted to one of the kinds."""
+    if name == "train_freq" and not isinstance(value, list | tuple):  # or [4, "episode"]
+        kinds = ["int"]
+    if "any" in kinds or (value is None and "None" in kinds):
+        return value
+    if isinstance(value, str):
+        if f"={value}" in kinds or (value == "auto" and name in AUTO):
+            return value
+        if "schedule" in kinds and value.startswith(("lin_", "exp_")):
+            return value
+    described = " or ".join(_WORDS.get(kind, kind.lstrip("=")) for kind in kinds)
+    fault = f"{name} must be {described}, not {shown(value)}"
+    plain = [_PLAIN[kind] for kind in kinds if kind in _PLAIN]
+    if (isinstance(value, bool) and bool not in plain) or not plain:
+        raise UserError(fault)
+    limits = _RANGE_OF.get(name)
+    expected: Any = typing.Union[tuple(plain)]  # noqa: UP007
+    try:
+        given = expected if limits is None or str in plain else Annotated[expected, limits]
+        found = TypeAdapter(given).validate_python(value)
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"]
+        reason = f": {reason[0].lower()}{reason[1:]}" if limits is not None else ""
+        raise UserError(f"{fault}{reason}") from None
+    if isinstance(found, float) and not math.isfinite(found) and name != "max_grad_norm":
+        raise UserError(f"{name} must be finite, not {shown(value)}")
+    return found
+
+
+if __name__ == "__main__":
+    from rl_yardstick.agents import ALGORITHMS
+
+    names = [name for name, entry in ALGORITHMS.items() if entry.is_installed]
+    signatures = {name: read_signature(name) for name in (*names, *WRAPPERS)}
+    TABLE.write_text(json.dumps(signatures, indent=1) + "\n", encoding="utf-8")

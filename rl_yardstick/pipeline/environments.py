@@ -12,11 +12,10 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
 import rl_yardstick.envs  # noqa: F401  # registers this project's environments
-from rl_yardstick.agents.registry import ALGORITHMS
+from rl_yardstick.agents.registry import ALGORITHMS, fitting_algorithms, is_bandit
 from rl_yardstick.envs.wrappers import ActionMasks, has_masks
-from rl_yardstick.pipeline.components import build
+from rl_yardstick.pipeline.components import build, import_modules, split_id
 from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
-from rl_yardstick.pipeline.modules import import_modules, split_id
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # The time limit of evaluations if neither environment nor settings have one: a greedy policy that
@@ -26,7 +25,6 @@ MISTAKES = (
     *(TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError),
     *(OSError, ImportError, MemoryError, gym.error.Error),
 )
-_OF_MAKE = ("max_episode_steps", "render_mode")  # arguments that `gymnasium.make` uses itself
 
 Env = gym.Env[Any, Any]
 
@@ -47,11 +45,11 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> Env:
         return gym.make(env_id, **kwargs)
     except MISTAKES as error:
         parameters = _parameters(env_id)
+        known = [*parameters, "max_episode_steps", "render_mode"]  # of `gymnasium.make` itself
+        foreign = [name for name in kwargs if name not in known]
         takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-        known = [*parameters, *_OF_MAKE]
-        foreign = next((name for name in kwargs if name not in known), None)
-        if foreign is not None and parameters and not takes_any:
-            raise unknown(f"{env_id}: unknown argument", foreign, known) from error
+        if foreign and parameters and not takes_any:
+            raise unknown(f"{env_id}: unknown argument", foreign[0], known) from error
         # Gymnasium adds all arguments to some errors.
         what = one_line(error).partition(" was raised from the environment creator")[0]
         what = f"there is no {what}" if isinstance(error, KeyError) else what
@@ -63,11 +61,11 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> Env:
 def _parameters(env_id: str) -> Mapping[str, inspect.Parameter]:
     """The arguments of the class or function that makes an environment."""
     with suppress(ImportError, AttributeError, TypeError, ValueError):
-        return inspect.signature(creator(env_id)).parameters
+        return inspect.signature(_creator(env_id)).parameters
     return {}
 
 
-def creator(env_id: str) -> Any:
+def _creator(env_id: str) -> Any:
     """The class or function that makes an environment."""
     entry_point = gym.spec(env_id).entry_point
     return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
@@ -109,11 +107,10 @@ def training_changes(spec: TrainSpec) -> tuple[str, ...]:
         if key == "max_episode_steps" and key not in training:
             continue  # evaluations need a limit where the environment has none
         value, other = (kwargs.get(key, usual.get(key)) for kwargs in (training, evaluation))
+        words = "random starts" if (key, value) == ("random_start", True) else f"{key} {value}"
         if key == "max_episode_steps":
             value, other = (None if limit == -1 else limit for limit in (value, other))
             words = f"episodes of {value} steps" if value else "no time limit"
-        else:
-            words = "random starts" if (key, value) == ("random_start", True) else f"{key} {value}"
         if value != other:
             told.append(words)
     for wrapper in spec.train_env_wrapper:
@@ -121,30 +118,11 @@ def training_changes(spec: TrainSpec) -> tuple[str, ...]:
         bounds = [f"{bound:g}" for bound in given if bound is not None]
         name = wrapper.name.rpartition(".")[2]
         if name == "ScaleReward" and "scale" in wrapper.kwargs:
-            told.append(f"rewards x {wrapper.kwargs['scale']:g}")
+            name = f"rewards x {wrapper.kwargs['scale']:g}"
         elif name == "ClipReward" and bounds:
-            told.append(f"rewards clipped at {' and '.join(bounds)}")
-        else:
-            told.append(name)
+            name = f"rewards clipped at {' and '.join(bounds)}"
+        told.append(name)
     return tuple(told)
-
-
-def wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = None) -> Env:
-    """An environment in its wrappers, with masks outermost for agents that need them."""
-    lists = {"env_wrapper": spec.env_wrapper}
-    if training:
-        lists["train_env_wrapper"] = spec.train_env_wrapper
-    for where, components in lists.items():
-        for component in components:
-            env = build(component, gym.Wrapper, where, spec.gym_packages, folder, env)
-    if spec.algorithm.get("mask_actions", False):
-        try:
-            return ActionMasks(env)
-        except ValueError as error:
-            raise UserError(f"mask_actions: {one_line(error)}") from error
-    # Without masks, `check_fit` names the agents that fit.
-    needs_masks = spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks
-    return ActionMasks(env) if needs_masks and has_masks(env) else env
 
 
 def remembers(spec: TrainSpec) -> bool:
@@ -155,32 +133,35 @@ def remembers(spec: TrainSpec) -> bool:
 
 def check_fit(spec: TrainSpec) -> None:
     """Raise UserError if the agent cannot work with the wrapped environment."""
-    from rl_yardstick.agents import fitting_algorithms
-    from rl_yardstick.agents.registry import is_bandit
-
     with closing(make_single_env(spec, training=True)) as env:
-        misfit = ALGORITHMS[spec.algo].env_misfit(env)
-        spaces = env.observation_space, env.action_space
-        fitting = fitting_algorithms(*spaces, is_bandit(env), has_masks(env)) if misfit else []
-    if misfit:
-        others = f"fitting agents: {', '.join(fitting)}" if fitting else "no agent here fits"
-        raise UserError(f"{spec.algo} does not fit {spec.env_id}: {misfit}; {others}")
+        if misfit := ALGORITHMS[spec.algo].env_misfit(env):
+            spaces = env.observation_space, env.action_space
+            fitting = fitting_algorithms(*spaces, is_bandit(env), has_masks(env))
+            others = f"fitting agents: {', '.join(fitting)}" if fitting else "no agent here fits"
+            raise UserError(f"{spec.algo} does not fit {spec.env_id}: {misfit}; {others}")
 
 
 # --- making them ----------------------------------------------------------------------------------
 
 
-def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> Env:
+def _wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = None) -> Env:
+    """An environment in its wrappers, with masks outermost for agents that need them."""
+    for where in ("env_wrapper", *(["train_env_wrapper"] if training else [])):
+        for component in getattr(spec, where):
+            env = build(component, gym.Wrapper, where, spec.gym_packages, folder, env)
+    # Without masks, `check_fit` names the agents that fit.
+    needs_masks = spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks and has_masks(env)
+    try:
+        is_masked = spec.algorithm.get("mask_actions", False) or needs_masks
+        return ActionMasks(env) if is_masked else env
+    except ValueError as error:
+        raise UserError(f"mask_actions: {one_line(error)}") from error
+
+
+def make_single_env(spec: TrainSpec, training: bool = False) -> Env:
     """Make one wrapped environment, outside any VecEnv."""
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
-    return wrapped(spec, make_env(spec.env_id, {**kwargs, **extra}), training)
-
-
-def make_training_env(spec: TrainSpec, folder: Path | None, appending: bool = False) -> Any:
-    """Make the training environments, each in a Monitor that writes into the folder."""
-    monitor = {"override_existing": False} if appending else {}
-    seed = first_seed(spec)
-    return _make_vec_env(spec, True, folder, n_envs=spec.n_envs, seed=seed, monitor_kwargs=monitor)
+    return _wrapped(spec, make_env(spec.env_id, kwargs), training)
 
 
 def first_seed(spec: TrainSpec) -> int:
@@ -189,6 +170,12 @@ def first_seed(spec: TrainSpec) -> int:
     Two runs with different seeds and equally many environments share no seed.
     """
     return spec.seed * spec.n_envs
+
+
+def make_training_env(spec: TrainSpec, folder: Path | None, appending: bool = False) -> Any:
+    """Make the training environments, each in a Monitor that writes into the folder."""
+    monitor = {"override_existing": False} if appending else {}
+    return _make_vec_env(spec, True, spec.n_envs, folder, {**spec.monitor_kwargs, **monitor})
 
 
 def make_evaluation_env(
@@ -200,25 +187,21 @@ def make_evaluation_env(
 ) -> Any:
     """Make the evaluation VecEnv.
 
-    Args:
-        spec: the training.
-        n_envs: environments in it.
-        wrap_innermost: put around each environment, inside all other wrappers.
-        monitor_folder: where Monitors write.
-        extra: further arguments of the environments.
+    ``wrap_innermost`` is put around each environment, inside all other wrappers; Monitors write
+    into ``monitor_folder``; ``extra`` are further arguments of the environments.
     """
-    return _make_vec_env(
-        spec, False, monitor_folder, wrap_innermost, extra, n_envs=n_envs, monitor_kwargs={}
-    )
+    monitor = spec.monitor_kwargs
+    return _make_vec_env(spec, False, n_envs, monitor_folder, monitor, wrap_innermost, **extra)
 
 
 def _make_vec_env(
     spec: TrainSpec,
     training: bool,
+    n_envs: int,
     folder: Path | None,
+    monitor_kwargs: dict[str, Any],
     wrap_innermost: Callable[[Env], Env] | None = None,
-    extra: Mapping[str, Any] | None = None,
-    **given: Any,
+    **extra: Any,
 ) -> Any:
     from stable_baselines3.common import vec_env
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -227,35 +210,30 @@ def _make_vec_env(
     in_processes = training and spec.vec_env == "subproc"
 
     def make(**kwargs: Any) -> Env:
-        if in_processes:
-            import_modules(spec.gym_packages)
-        env = make_env(spec.env_id, kwargs)
+        import_modules(spec.gym_packages if in_processes else [])
+        env = make_env(spec.env_id, {**kwargs, **extra})
         return env if wrap_innermost is None else wrap_innermost(env)
 
-    kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
-    given["monitor_kwargs"] = {**spec.monitor_kwargs, **given["monitor_kwargs"]}
     env: Any = make_vec_env(
         make,
-        env_kwargs={**kwargs, **(extra or {})},
+        n_envs,
+        first_seed(spec) if training else None,
+        env_kwargs=training_kwargs(spec) if training else evaluation_kwargs(spec),
         monitor_dir=None if folder is None else str(folder),
-        wrapper_class=lambda env: wrapped(spec, env, training, folder),
+        monitor_kwargs=monitor_kwargs,
+        wrapper_class=lambda env: _wrapped(spec, env, training, folder),
         vec_env_cls=vec_env.SubprocVecEnv if in_processes else vec_env.DummyVecEnv,
-        **given,
     )
-    try:
-        for component in spec.vec_env_wrapper:
-            where, base = "vec_env_wrapper", vec_env.VecEnvWrapper
-            env = build(component, base, where, spec.gym_packages, folder, env)
-        if spec.normalize is not None:
-            # Statistics come from training, and evaluations report returns as they are.
-            fixed = {} if training else {"norm_reward": False, "training": False}
-            env = vec_env.VecNormalize(env, **{**spec.normalize, **fixed})
-        if spec.frame_stack is not None:
-            env = vec_env.VecFrameStack(env, spec.frame_stack)
-        return BaseAlgorithm._wrap_env(env)
-    except BaseException:
-        env.close()
-        raise
+    for component in spec.vec_env_wrapper:
+        where, base = "vec_env_wrapper", vec_env.VecEnvWrapper
+        env = build(component, base, where, spec.gym_packages, folder, env)
+    if spec.normalize is not None:
+        # Statistics come from training, and evaluations report returns as they are.
+        fixed = {} if training else {"norm_reward": False, "training": False}
+        env = vec_env.VecNormalize(env, **{**spec.normalize, **fixed})
+    if spec.frame_stack is not None:
+        env = vec_env.VecFrameStack(env, spec.frame_stack)
+    return BaseAlgorithm._wrap_env(env)
 
 
 # --- files that arguments name --------------------------------------------------------------------
@@ -271,19 +249,15 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
     found = dict(entry)
     for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
-        kwargs = entry.get(key)
-        named = [name for name in ("desc", "log") if isinstance((kwargs or {}).get(name), str)]
-        kind = creator(env_id) if named else None
-        if not isinstance(kind, type):
-            continue
-        assert isinstance(kwargs, dict)
-        if "desc" in named and issubclass(kind, GridWorld):
+        kwargs = found.get(key) if isinstance(found.get(key), dict) else {}
+        desc, log = kwargs.get("desc"), kwargs.get("log")
+        if isinstance(desc, str) and _makes(env_id, GridWorld):
             try:
-                found[key] = {**kwargs, "desc": list(read_rows(kwargs["desc"]))}
+                found[key] = {**kwargs, "desc": list(read_rows(desc))}
             except ValueError as error:
                 raise UserError(f"{env_id}: {one_line(error)}") from error
-        if "log" in named and issubclass(kind, ReplayBandit):
-            found[key] = {**kwargs, "log": str(Path(kwargs["log"]).absolute())}
+        if isinstance(log, str) and _makes(env_id, ReplayBandit):
+            found[key] = {**kwargs, "log": str(Path(log).absolute())}
     return found
 
 
@@ -293,7 +267,10 @@ def map_name(env_id: str, entry: Mapping[str, Any]) -> str:
 
     parts = [entry.get(key) or {} for key in ("eval_env_kwargs", "env_kwargs")]
     given = next((part["desc"] for part in parts if "desc" in part), None)
-    if not isinstance(given, str) or "\n" in given:
-        return ""
-    kind = creator(env_id)
-    return Path(given).name if isinstance(kind, type) and issubclass(kind, GridWorld) else ""
+    is_path = isinstance(given, str) and "\n" not in given and _makes(env_id, GridWorld)
+    return Path(given).name if is_path else ""
+
+
+def _makes(env_id: str, kind: type) -> bool:
+    creator = _creator(env_id)
+    return isinstance(creator, type) and issubclass(creator, kind)

@@ -5,43 +5,37 @@ from __future__ import annotations
 import difflib
 import re
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 _SHORT_LIST = 12
-
-# Other names of hyperparameters, too different in spelling to be found by similarity.
-OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(("lr", "alpha", "step_size", "eta"), ("learning_rate",)),
-    **dict.fromkeys(
-        ("epsilon", "eps", "final_epsilon", "final_eps", "epsilon_end", "eps_end", "min_epsilon"),
-        ("exploration_final_eps", "exploration_initial_eps"),
-    ),
-    **dict.fromkeys(
-        ("initial_epsilon", "initial_eps", "epsilon_start", "eps_start", "max_epsilon"),
-        ("exploration_initial_eps",),
-    ),
-    **dict.fromkeys(
-        ("epsilon_decay", "eps_decay", "decay"), ("exploration_decay", "exploration_fraction")
-    ),
-    **dict.fromkeys(("discount", "discount_factor", "discount_rate"), ("gamma",)),
-    **dict.fromkeys(("lam", "lambda", "gae"), ("gae_lambda",)),
-    **dict.fromkeys(("entropy", "entropy_coef", "entropy_coeff", "beta"), ("ent_coef",)),
-    **dict.fromkeys(("clip", "clip_eps", "clip_epsilon", "clip_param"), ("clip_range",)),
-    **dict.fromkeys(("minibatch_size", "mini_batch_size", "batch"), ("batch_size",)),
-    **dict.fromkeys(("replay_size", "memory_size", "replay_buffer_size"), ("buffer_size",)),
-    **dict.fromkeys(("target_update", "target_update_freq"), ("target_update_interval",)),
-    **dict.fromkeys(("warmup_steps", "start_steps"), ("learning_starts",)),
-    **dict.fromkeys(("epochs", "update_epochs"), ("n_epochs",)),
-    **dict.fromkeys(("net_arch", "hidden_sizes", "layers", "activation_fn"), ("policy_kwargs",)),
-    **dict.fromkeys(("timesteps", "total_timesteps", "steps"), ("n_timesteps",)),
-    **dict.fromkeys(("episodes", "num_episodes"), ("n_episodes",)),
-    **dict.fromkeys(("num_envs", "nenvs"), ("n_envs",)),
-    **dict.fromkeys(("q_init", "optimistic", "initial_value"), ("initial_q",)),
+# Hyperparameters, and other names for them, too different in spelling to be found by similarity.
+_INITIAL, _FINAL = "exploration_initial_eps", "exploration_final_eps"
+_SYNONYMS = {
+    "learning_rate": "lr alpha step_size eta",
+    f"{_FINAL} {_INITIAL}": "epsilon eps final_epsilon final_eps epsilon_end eps_end min_epsilon",
+    _INITIAL: "initial_epsilon initial_eps epsilon_start eps_start max_epsilon",
+    "exploration_decay exploration_fraction": "epsilon_decay eps_decay decay",
+    "gamma": "discount discount_factor discount_rate",
+    "gae_lambda": "lam lambda gae",
+    "ent_coef": "entropy entropy_coef entropy_coeff beta",
+    "clip_range": "clip clip_eps clip_epsilon clip_param",
+    "batch_size": "minibatch_size mini_batch_size batch",
+    "buffer_size": "replay_size memory_size replay_buffer_size",
+    "target_update_interval": "target_update target_update_freq",
+    "learning_starts": "warmup_steps start_steps",
+    "n_epochs": "epochs update_epochs",
+    "policy_kwargs": "net_arch hidden_sizes layers activation_fn",
+    "n_timesteps": "timesteps total_timesteps steps",
+    "n_episodes": "episodes num_episodes",
+    "n_envs": "num_envs nenvs",
+    "initial_q": "q_init optimistic initial_value",
+}
+OTHER_NAMES = {
+    other: names.split() for names, others in _SYNONYMS.items() for other in others.split()
 }
 
 _brief = reprlib.Repr()
 _brief.maxstring = _brief.maxother = 60
-
 
 # Control characters except line feeds and tabs; characters that change the writing direction; and
 # surrogates, which no file can contain.
@@ -57,6 +51,14 @@ class UserError(Exception):
         super().__init__(visible(" ".join(line.strip() for line in message.splitlines())))
 
 
+class Stopped(Exception):  # noqa: N818  # no error
+    """A signal, whose number it has, has ended the work at a safe moment."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
 def visible(text: str) -> str:
     """The text with control characters escaped, so that a terminal shows them."""
     return _OBEYED.sub(lambda sign: sign[0].encode("unicode_escape").decode("ascii"), text)
@@ -67,41 +69,24 @@ def shown(value: object) -> str:
     return _brief.repr(value)
 
 
-def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:
-    """A hint with the known names nearest to ``name``, or all known names if none is near.
-
-    If there are many known names and none is near, the hint is empty.
-    """
-    known = list(dict.fromkeys(known))
-    by_lower_case = {option.lower(): option for option in known}
-    near = [other for other in OTHER_NAMES.get(name.lower(), ()) if other in known] or [
-        by_lower_case[match] for match in difflib.get_close_matches(name.lower(), by_lower_case, n)
-    ]
-    if near:
-        return f"did you mean {' or '.join(map(repr, near))}?"
-    if 0 < len(known) <= _SHORT_LIST:
-        return f"known are {', '.join(known)}"
-    return ""
-
-
-def unknown(what: str, name: str, known: Iterable[str], n: int = 1) -> UserError:
-    """The error for a ``name`` that is not among ``known``: "{what} 'name': did you mean ...?"."""
-    hint = did_you_mean(name, known, n)
-    return UserError(f"{what} {shown(name)}" + (f": {hint}" if hint else ""))
-
-
 def one_line(error: BaseException) -> str:
     """The message of an exception in one line, or its type if it has no message."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
-class Stopped(Exception):  # noqa: N818  # no error
-    """A signal has ended the work at a safe moment.
+def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:
+    """A hint with the nearest known names; or if none is near, with all, unless they are many."""
+    by_lower_case = {option.lower(): option for option in known}
+    near = [other for other in OTHER_NAMES.get(name.lower(), ()) if other in by_lower_case] or [
+        by_lower_case[match] for match in difflib.get_close_matches(name.lower(), by_lower_case, n)
+    ]
+    if near:
+        return f"did you mean {' or '.join(map(repr, near))}?"
+    names = by_lower_case.values()
+    return f"known are {', '.join(names)}" if 0 < len(names) <= _SHORT_LIST else ""
 
-    Attributes:
-        number: of the signal.
-    """
 
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
+def unknown(what: str, name: str, known: Iterable[str], n: int = 1) -> UserError:
+    """The error for a ``name`` that is not among ``known``: "{what} 'name': did you mean ...?"."""
+    hint = did_you_mean(name, known, n)
+    return UserError(f"{what} {shown(name)}{': ' if hint else ''}{hint}")

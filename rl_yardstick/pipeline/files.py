@@ -9,16 +9,16 @@ import math
 import os
 import re
 import secrets
-import stat
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from numpy.lib.format import read_array
+from numpy.typing import NDArray
 
 from rl_yardstick.pipeline.errors import UserError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from rl_yardstick.safe_files.files import UnsafeFileError, read_file
 
 MAX_TEXT = 10_000_000  # bytes of a settings file
 MAX_ARRAYS = 1 << 31  # bytes of an archive of arrays
@@ -39,21 +39,11 @@ def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def read_bytes(path: Path, limit: int = MAX_TEXT) -> bytes:
-    """The content of a regular file of at most ``limit`` bytes.
-
-    Raises:
-        UserError: if the file is missing, unreadable, too large, or not a regular file.
-    """
+    """The content of a regular file of at most ``limit`` bytes; UserError if it is none."""
     try:
-        # Without O_NONBLOCK, opening a named pipe waits for somebody who writes to it.
-        number = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-        with os.fdopen(number, "rb") as file:
-            status = os.fstat(number)
-            if not stat.S_ISREG(status.st_mode):
-                raise UserError(f"{path} is not a regular file")
-            if status.st_size > limit:
-                raise UserError(f"{path}: {status.st_size:,} bytes, the limit is {limit:,}")
-            return file.read(status.st_size)
+        return read_file(path, limit)
+    except UnsafeFileError as error:
+        raise UserError(str(error)) from error
     except OSError as error:
         raise UserError(f"{path}: {(error.strerror or str(error)).lower()}") from error
 
@@ -77,30 +67,23 @@ def read_json(path: Path, limit: int = MAX_TEXT) -> Any:
 def read_arrays(
     path: Path, shapes: Mapping[str, str], optional: Collection[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Arrays of numbers in a NumPy archive, which is read as data.
+    """Arrays of numbers in a NumPy archive, which is read as data; the ``optional`` may be missing.
 
-    Args:
-        path: the archive.
-        shapes: names of arrays, and of their axes: axes of one name must have the same length.
-        optional: names of arrays that may be missing.
+    ``shapes`` has the names of arrays and of their axes: those of one name have the same length.
     """
-    from numpy.lib.format import read_array
-
     from rl_yardstick.safe_files.archives import read_members
 
     found: dict[str, NDArray[Any]] = {}
     lengths: dict[str, int] = {}
     try:
         members = read_members(read_bytes(path, MAX_ARRAYS))
-        for name, axes in shapes.items():
-            if name in optional and f"{name}.npy" not in members:
-                continue
-            content = members[f"{name}.npy"]
-            found[name] = read_array(io.BytesIO(content), allow_pickle=False)
-            sizes = zip(axes.split(), found[name].shape, strict=True)
+        for name in [n for n in shapes if n not in optional or f"{n}.npy" in members]:
+            array = read_array(io.BytesIO(members[f"{name}.npy"]), allow_pickle=False)
+            sizes = zip(shapes[name].split(), array.shape, strict=True)
             wanted = [int(a) if a.isdigit() else lengths.setdefault(a, n) for a, n in sizes]
-            if found[name].dtype.kind not in "biuf" or tuple(wanted) != found[name].shape:
+            if array.dtype.kind not in "biuf" or tuple(wanted) != array.shape:
                 raise ValueError(f"{name} has another shape or kind")
+            found[name] = array
     except (ValueError, LookupError, OverflowError, MemoryError) as error:
         raise UserError(f"{path} is damaged: {error}") from error
     return found
@@ -135,10 +118,6 @@ def write_json(path: Path, data: Any) -> None:
     write_text(path, f"{json_text(data, indent=2)}\n")
 
 
-# A valid JSON number that is too large for a double: Python and browsers read it as infinity.
-_INFINITY = "1e999"
-
-
 def plain(value: Any, infinities: Mapping[float, str] | None = None) -> Any:
     """The value as JSON types: nan becomes None, infinities become the given texts."""
     match value:
@@ -156,10 +135,8 @@ def plain(value: Any, infinities: Mapping[float, str] | None = None) -> Any:
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
-    """The value as JSON, with infinity as a number beyond the range of doubles."""
-    # Random texts, which no value can contain.
-    tokens = {sign: secrets.token_hex(16) for sign in (math.inf, -math.inf)}
-    text = json.dumps(plain(value, tokens), indent=indent, allow_nan=False)
-    for sign, token in tokens.items():
-        text = text.replace(f'"{token}"', _INFINITY if sign > 0 else f"-{_INFINITY}")
-    return text
+    """The value as JSON, with infinity as 1e999, which Python and browsers read as infinity."""
+    token = secrets.token_hex(16)  # which no value can contain
+    signs = {math.inf: f"+{token}", -math.inf: f"-{token}"}
+    text = json.dumps(plain(value, signs), indent=indent, allow_nan=False)
+    return text.replace(f'"+{token}"', "1e999").replace(f'"-{token}"', "-1e999")

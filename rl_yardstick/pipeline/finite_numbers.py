@@ -6,97 +6,89 @@ network turns infinity into nan, and so does the first difference from a mean th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
 import numpy as np
 import torch as th
-from numpy import vdot
-from numpy.typing import NDArray
 
 from rl_yardstick.agents.bandits.tables import BanditPolicy
+from rl_yardstick.agents.common.callbacks import BlockCallback
 from rl_yardstick.pipeline.errors import UserError
 
-# Single and double precision, whose scalar products BLAS computes.
-_FAST = frozenset("fd")
-_FAST_TENSORS = frozenset({th.float32, th.float64})
-_WHOLE = frozenset("?bBhHiIlLqQ")
+# Log entries of the library's agents. Others may be nan, as the explained variance of constants.
+_LOSSES = tuple(
+    f"train/{name}" for name in ("loss", "actor_loss", "critic_loss", "ent_coef_loss", "value_loss")
+)
 
 
 class NotFiniteError(UserError):
     """A number is nan or infinite where it must be finite."""
 
-    def __init__(self, place: str, value: float) -> None:
-        super().__init__(f"{place} is {value}")
 
+def check_numbers(values: Any, what: str, when: str, in_rows: bool = False) -> None:
+    """Check that all numbers of an array or a mapping of arrays are finite; None passes.
 
-def is_finite(values: Any) -> bool:
-    """Whether all numbers of an array or a mapping of arrays are finite; fast, for every step."""
-    if type(values) is not np.ndarray:
-        return values is None or all(is_finite(array) for _, array in _parts(values))
-    kind = values.dtype.char
-    if kind in _FAST:
-        # One call instead of two with a temporary array; it also overflows for large finite values.
-        return isfinite(vdot(values, values)) or bool(np.isfinite(values).all())
-    return kind in _WHOLE or bool(np.isfinite(values).all())
-
-
-def check_numbers(values: Any, what: str, when: str) -> None:
-    """Check that all numbers of an array or a mapping of arrays are finite; None passes."""
-    for name, array in _parts(values):
-        if not is_finite(array):
-            raise NotFiniteError(f"{what}{name} {when}", _culprit(array))
-
-
-def check_rows(values: Any, what: str, when: str) -> None:
-    """Like `check_numbers`, for values with a row for each environment, shape (n_envs, ...)."""
-    for name, array in _parts(values):
-        if not is_finite(array):
-            rows = np.isfinite(array).reshape(len(array), -1).all(axis=1)
-            i = int(np.argmin(rows))
-            raise NotFiniteError(f"{what}{name} of environment {i} {when}", _culprit(array[i]))
+    With ``in_rows``, there is a row for each environment, shape (n_envs, ...), which is named.
+    """
+    if isinstance(values, Mapping):
+        for name, array in values.items():
+            check_numbers(array, f"{what} {name!r}", when, in_rows)
+    elif values is not None and not np.isfinite(values).all():
+        array = np.asarray(values)
+        flat = np.ravel(array)
+        place = int(np.argmin(np.isfinite(flat)))
+        row = f" of environment {place * len(array) // flat.size}" if in_rows else ""
+        raise NotFiniteError(f"{what}{row} {when} is {float(np.real(flat[place]))}")
 
 
 def check_model(model: Any) -> None:
-    """Check that an agent's tables or weights and its statistics are finite."""
-    when = f"at step {model.num_timesteps:,}"
-    policy = getattr(model, "policy", None)
+    """Check that an agent's tables or weights are finite."""
+    when, policy = f"at step {model.num_timesteps:,}", getattr(model, "policy", None)
     if isinstance(policy, th.nn.Module):
         for name, table in policy.state_dict().items():
             # An infinite score marks an arm that was never pulled.
             is_scores = name == "scores" and isinstance(policy, BanditPolicy)
             tensor = table[policy.get_buffer("counts") > 0] if is_scores else table
-            if not _is_finite_tensor(tensor):
+            if not th.isfinite(tensor).all():
                 values = tensor.detach().cpu().double().numpy()
-                raise NotFiniteError(f"a value in {name} of the agent {when}", _culprit(values))
-    normalization = model.get_vec_normalize_env()
-    if normalization is not None:
-        for name in ("obs_rms", "ret_rms"):
-            statistics = getattr(normalization, name, None)
-            parts = statistics if isinstance(statistics, dict) else {"": statistics}
-            for key, part in parts.items():
-                if part is not None:
-                    what = f"{name} of VecNormalize{f' ({key})' if key else ''}"
-                    check_numbers({"mean": part.mean, "variance": part.var}, what, when)
+                check_numbers(values, f"a value in {name} of the agent", when)
 
 
-def _is_finite_tensor(tensor: th.Tensor) -> bool:
-    if tensor.dtype in _FAST_TENSORS:
-        return is_finite(tensor.detach().cpu().numpy())
-    return not tensor.is_floating_point() or bool(th.isfinite(tensor).all())
+class NumberWatch(BlockCallback):
+    """Checks the numbers of each step (or of a compiled block's last step) and the losses."""
 
+    takes_blocks = True
 
-def _parts(values: Any) -> Iterator[tuple[str, NDArray[Any]]]:
-    """The arrays among values, each with its name for messages."""
-    if isinstance(values, Mapping):
-        for name, array in values.items():
-            yield f" {name!r}", np.asarray(array)
-    elif values is not None:
-        yield "", np.asarray(values)
+    def update_locals(self, locals_: dict[str, Any]) -> None:
+        """Keep the training loop's variables without a copy, because this runs at each step."""
+        self.locals = locals_
 
+    def _on_training_start(self) -> None:
+        when = f"at step {self.model.num_timesteps:,}"
+        check_numbers(self.model._last_obs, "observation", when, in_rows=True)
 
-def _culprit(values: NDArray[Any]) -> float:
-    """Find the first number that is not finite."""
-    flat = np.ravel(values)
-    return float(np.real(flat[np.argmin(np.isfinite(flat))]))
+    def _on_rollout_start(self) -> None:
+        log = self.model.logger.name_to_value
+        for name in _LOSSES:
+            if name in log and not isfinite(log[name]):
+                raise NotFiniteError(f"{name} at step {self.model.num_timesteps:,} is {log[name]}")
+
+    def _on_step(self) -> bool:
+        # Algorithms that play whole episodes, such as ARS, pass other variables.
+        seen, when = self.locals, f"at step {self.num_timesteps:,}"
+        check_numbers(seen.get("rewards"), "reward", when, in_rows=True)
+        new_obs = seen.get("new_obs", seen.get("new_observations"))
+        check_numbers(new_obs, "observation", when, in_rows=True)
+        check_numbers(seen.get("actions"), "action", when, in_rows=True)
+        dones = seen.get("dones")
+        if dones is None or True not in (ended := dones.tolist()):
+            return True
+        # Observations before resets, and the returns in Monitor's records.
+        for i, info in enumerate(seen["infos"]):
+            if ended[i]:
+                where = f"of an episode of environment {i} {when}"
+                check_numbers(info.get("terminal_observation"), "last observation", where)
+                check_numbers(info.get("episode", {}).get("r"), "return", where)
+        return True

@@ -17,19 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
-from rl_yardstick.pipeline.arguments import constructor_parameters
+from rl_yardstick.pipeline.components import arguments_of, check_typed, module_name
 from rl_yardstick.pipeline.environments import check_env_id
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.files import read_bytes
-from rl_yardstick.pipeline.modules import check_typed
-from rl_yardstick.pipeline.run import RECORD, Run, numbered_runs, spec_in, statistics_beside
-from rl_yardstick.pipeline.settings import (
-    SPECIAL,
-    check_agent,
-    components,
-    read_entry,
-    read_saved,
-)
+from rl_yardstick.pipeline.run import RECORD, Run, numbered_runs, statistics_beside
+from rl_yardstick.pipeline.settings import check_agent, read_entry, read_saved, special_settings
 from rl_yardstick.pipeline.spec import TrainSpec, validated
 
 if TYPE_CHECKING:
@@ -73,33 +66,19 @@ class Model:
 
 
 def find_model(wanted: Wanted) -> Model:
-    """Find the requested model, without importing torch.
-
-    Raises:
-        UserError: if there is none, or it needs modules that were not typed.
-    """
-    if wanted.path is None:
-        folder = find_run(
-            wanted.log_folder,
-            wanted.algo or "ppo",
-            wanted.env_id or "CartPole-v1",
-            wanted.number,
-        )
-        path = model_in(folder, wanted.which)
-    else:
-        path = wanted.path
-        with_suffix = path.with_name(f"{path.name}.zip")
-        if not (path / RECORD).exists() and with_suffix.is_file():
-            path = with_suffix  # typed without its suffix, as for SB3
-        if path.is_dir():
-            path = model_in(path, wanted.which)
-        elif wanted.which != "final":
-            raise UserError(f"{path} is one model: give its folder for another one of the run")
+    """Find the requested model, without importing torch or modules that were not typed."""
+    path = wanted.path or _find_run(wanted)
+    with_suffix = path.with_name(f"{path.name}.zip")
+    if not (path / RECORD).exists() and with_suffix.is_file():
+        path = with_suffix  # typed without its suffix, as for SB3
+    if path.is_dir():
+        path = model_in(path, wanted.which)
+    elif wanted.which != "final":
+        raise UserError(f"{path} is one model: give its folder for another one of the run")
     data = zip_data(path)
     spec = _spec_of(path, data, wanted)
-    changes = {**spec.eval_env_kwargs, **wanted.env_kwargs}
     spec = spec.changed(
-        eval_env_kwargs=changes,
+        eval_env_kwargs={**spec.eval_env_kwargs, **wanted.env_kwargs},
         seed=wanted.seed,
         device=wanted.device,
         gym_packages=wanted.typed,
@@ -107,41 +86,36 @@ def find_model(wanted: Wanted) -> Model:
     )
     check_agent(spec.algo)
     check_env_id(spec.env_id)
-    if data.get("mask_actions") is True and "mask_actions" not in spec.algorithm:
-        spec = spec.changed(algorithm={**spec.algorithm, "mask_actions": True})
-    run = path.parent if (path.parent / RECORD).is_file() else None
     statistics = wanted.statistics
     if statistics is None and spec.normalize is not None:
         statistics = statistics_of(path)
         if statistics is None and spec.normalize.get("norm_obs", True):
-            raise UserError(
-                f"{path} was trained on normalised observations, but their statistics are "
-                "missing: name their file with --vec-normalize"
-            )
-    return Model(path, _normalising(spec, statistics), run, statistics)
+            fault = "trained on normalised observations, but their statistics are missing"
+            raise UserError(f"{path} was {fault}: name their file with --vec-normalize")
+    run = path.parent if (path.parent / RECORD).is_file() else None
+    return Model(path, _as_saved(spec, data, statistics), run, statistics)
 
 
 def model_of_run(run: Run, which: Which = "final") -> Model:
     """The model of a finished run, ready to play."""
-    spec = run.spec()
-    path = model_in(run.path, which)
-    statistics = None if spec.normalize is None else statistics_of(path)
-    return Model(path, spec, run.path, statistics)
+    spec, path = run.spec(), model_in(run.path, which)
+    return Model(path, spec, run.path, None if spec.normalize is None else statistics_of(path))
 
 
-def find_run(log_folder: Path, algo: str, env_id: str, number: int = 0) -> Path:
+def _find_run(wanted: Wanted) -> Path:
     """The folder of a run by its number; 0: the newest, -1: the one without a number."""
-    name = env_id.replace("/", "-")
-    runs = dict(numbered_runs(log_folder / algo, name))
-    if number < 0 or (not runs and (log_folder / algo / f"{name}.zip").exists()):
-        return log_folder / algo
+    algo, env_id = wanted.algo or "ppo", wanted.env_id or "CartPole-v1"
+    folder, name, number = wanted.log_folder / algo, env_id.replace("/", "-"), wanted.number
+    runs = dict(numbered_runs(folder, name))
+    if number < 0 or (not runs and (folder / f"{name}.zip").exists()):
+        return folder
     if not runs:
         check_agent(algo)
         check_env_id(env_id)
-        raise UserError(f"no run of {algo} on {name} in {log_folder}")
+        raise UserError(f"no run of {algo} on {name} in {wanted.log_folder}")
     if number and number not in runs:
-        known = ", ".join(map(str, runs))
-        raise UserError(f"no run {number} of {algo} on {name} in {log_folder}: there is {known}")
+        where, known = wanted.log_folder, ", ".join(map(str, runs))
+        raise UserError(f"no run {number} of {algo} on {name} in {where}: there is {known}")
     return runs[number or max(runs)]
 
 
@@ -149,22 +123,20 @@ def model_in(folder: Path, which: Which = "final") -> Path:
     """The zip of a run folder."""
     if not folder.is_dir():
         raise UserError(f"{folder} is no run folder")
-    checkpoints = Run(folder).checkpoints()
-    if which == "last checkpoint" and not checkpoints:
-        raise UserError(f"{folder} holds no checkpoint: train with --save-freq")
     if which == "final":
         models = sorted(p for p in folder.glob("*.zip") if not _OTHER_ZIPS.fullmatch(p.name))
         if len(models) == 1:
             return models[0]
         held = ", ".join(path.name for path in models) or "no model of a whole training"
         raise UserError(f"{folder} holds {held}: name the zip")
+    steps = list(Run(folder).checkpoints())
     if which == "last checkpoint":
-        return list(checkpoints.values())[-1]
+        which = steps[-1] if steps else 0
     path = folder / ("best_model.zip" if which == "best" else f"rl_model_{which}_steps.zip")
     if not path.exists():
-        known = ", ".join(map(str, checkpoints))
-        hint = f": there are checkpoints after {known} steps" if checkpoints else ""
-        raise UserError(f"{folder} holds no {path.name}{hint}")
+        known = f"there are checkpoints after {', '.join(map(str, steps))} steps"
+        hint = known if steps else "for checkpoints, train with --save-freq"
+        raise UserError(f"{folder} holds no {path.name}: {hint}")
     return path
 
 
@@ -183,16 +155,12 @@ def replay_buffer_of(model: Path) -> Path | None:
 
 
 def zip_data(path: Path) -> dict[str, Any]:
-    """The JSON in an agent's zip; pickles in it stay text.
-
-    Raises:
-        UserError: if the file is no whole zip of an agent.
-    """
+    """The JSON in an agent's zip; pickles in it stay text."""
     from rl_yardstick.safe_files.archives import first_look
 
     content = read_bytes(path, MAX_MODEL)
     try:
-        return dict(first_look(content))
+        return first_look(content)
     except ValueError as error:
         raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
 
@@ -201,14 +169,18 @@ def _spec_of(path: Path, data: Mapping[str, Any], wanted: Wanted) -> TrainSpec:
     """The settings of a model, from the first source that has them."""
     folder = path.parent
     if (folder / RECORD).is_file():
-        spec = spec_in(Run(folder).recorded(), folder)
+        spec = Run(folder).spec()
         check_typed(spec.gym_packages, wanted.typed, str(folder))
-        return spec.changed(
-            algo=wanted.algo or spec.algo, env_id=wanted.env_id or spec.env_id, trained_agent=None
-        )
-    args, config = _saved_settings(folder, path.stem)
-    algo = wanted.algo or _own_algorithm(data) or args.get("algo") or ""
-    env_id = wanted.env_id or args.get("env") or ""
+        algo, env_id = wanted.algo or spec.algo, wanted.env_id or spec.env_id
+        return spec.changed(algo=algo, env_id=env_id, trained_agent=None)
+    places = [folder / path.stem, folder, *(p.parent for p in folder.glob("*/config.yml"))]
+    files = [(place / "args.yml", place / "config.yml") for place in places]  # of rl_zoo3
+    present = next((both for both in files if any(file.is_file() for file in both)), ())
+    args, config = [read_saved(file) if file.is_file() else {} for file in present] or ({}, None)
+    end = f":{data.get('algorithm')}"  # the class of a hand-written agent
+    own = [name for name, one in ALGORITHMS.items() if one.entry_point.endswith(end)]
+    algo = wanted.algo or next(iter(own), args.get("algo"))
+    env_id = wanted.env_id or args.get("env")
     if not (algo and env_id):
         missing = "--env" if algo else "--algo"
         raise UserError(f"{path} is in no run folder: say what it is with {missing}")
@@ -220,32 +192,11 @@ def _spec_of(path: Path, data: Mapping[str, Any], wanted: Wanted) -> TrainSpec:
             config = {**read_entry(algo, env_id), "normalize": None}
         except UserError:
             config = {}
-    special = {key: config[key] for key in SPECIAL if config.get(key) is not None}
-    for key in ("env_wrapper", "train_env_wrapper", "vec_env_wrapper", "callback"):
-        special[key] = components(special.get(key), key)
-    if isinstance(special.get("normalize"), bool):
-        special["normalize"] = {} if special["normalize"] else None
+    special = special_settings(config)
     special |= {"env_kwargs": args.get("env_kwargs") or special.get("env_kwargs") or {}}
     special |= {"n_timesteps": None, "n_episodes": None, "callback": [], "n_envs": 1}
     kept = {key: config[key] for key in ("mask_actions",) if key in config}
     return validated({"algo": algo, "env_id": env_id, "algorithm": kept, **special})
-
-
-def _saved_settings(folder: Path, name: str) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """The content of rl_zoo3's ``args.yml`` and ``config.yml``; None if there is no such file."""
-    places = [folder / name, folder, *sorted(p.parent for p in folder.glob("*/config.yml"))]
-    for place in places:
-        files = [place / "args.yml", place / "config.yml"]
-        if any(file.is_file() for file in files):
-            args, config = (read_saved(file) if file.is_file() else {} for file in files)
-            return args, config
-    return {}, None
-
-
-def _own_algorithm(data: Mapping[str, Any]) -> str | None:
-    """The hand-written agent that a zip names, or None."""
-    end = f":{data.get('algorithm')}"
-    return next((name for name, one in ALGORITHMS.items() if one.entry_point.endswith(end)), None)
 
 
 # --- loading --------------------------------------------------------------------------------------
@@ -253,12 +204,12 @@ def _own_algorithm(data: Mapping[str, Any]) -> str | None:
 
 def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
     """Load an agent to play, without the memory and schedules that training needs."""
-    algorithm = load_algorithm(model.spec.algo)
-    if _has_own_load(algorithm):
-        return load(model.spec, model.path, env, device=model.spec.device)
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.utils import ConstantSchedule
 
+    spec, algorithm = model.spec, load_algorithm(model.spec.algo)
+    if _has_own_load(algorithm):
+        return load(spec, model.path, env, device=spec.device)
     unused = ConstantSchedule(0.0)
     replaced: dict[str, Any] = {
         "learning_rate": 0.0,
@@ -267,37 +218,28 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
         "n_steps": 1,
     }
     if env is not None:
-        saved = zip_data(model.path).get("observation_space")
-        shapes = [_shown_space(one) for one in (saved, vars(env.observation_space))]
-        if saved is not None and shapes[0] != shapes[1]:
+        saved, here = zip_data(model.path).get("observation_space"), vars(env.observation_space)
+        found, needed = (
+            one.get("n", tuple(one.get("_shape") or ())) if isinstance(one, dict) else None
+            for one in (saved, here)
+        )
+        if found not in (None, needed):
+            fault = f"{found}, and the environment here gives shape {needed}"
             raise UserError(
-                f"{model.path} was trained on observations of {shapes[0]}, and the environment "
-                f"here gives {shapes[1]}: give the right --env-kwargs"
+                f"{model.path} was trained on observations of shape {fault}: give the right "
+                "--env-kwargs"
             )
         replaced["observation_space"] = env.observation_space
     small = {"buffer_size": 1, "optimize_memory_usage": False}
     extra = small if issubclass(algorithm, OffPolicyAlgorithm) else {}
-    given = {"device": model.spec.device, "custom_objects": replaced, **extra}
-    return load(model.spec, model.path, env, **given)
-
-
-def _shown_space(attributes: Any) -> str:
-    """A space in words, by its attributes."""
-    known = attributes if isinstance(attributes, dict) else {}
-    return f"{known['n']} kinds" if "n" in known else f"shape {tuple(known.get('_shape') or ())}"
+    return load(spec, model.path, env, device=spec.device, custom_objects=replaced, **extra)
 
 
 def load(spec: TrainSpec, path: Path, env: VecEnv | None, **replaced: Any) -> BaseAlgorithm:
     """The agent in a zip, which is read as data: nothing in it runs.
 
-    Args:
-        spec: names the agent, and the modules whose networks and buffers a zip may name.
-        path: the zip.
-        env: the agent's environments.
-        replaced: attributes of the agent to change.
-
-    Raises:
-        UserError: if it is no agent of this kind.
+    A zip may name networks and buffers in ``spec.gym_packages``; ``replaced`` are attributes of
+    the agent to change.
     """
     from rl_yardstick.safe_files.models import load_model
 
@@ -305,24 +247,19 @@ def load(spec: TrainSpec, path: Path, env: VecEnv | None, **replaced: Any) -> Ba
     content = io.BytesIO(read_bytes(path, MAX_MODEL))
     try:
         if _has_own_load(algorithm):
-            found: BaseAlgorithm = algorithm.load(content, env=env, **replaced)
-            return found
+            return algorithm.load(content, env=env, **replaced)  # type: ignore[no-any-return]
         with warnings.catch_warnings():
             # About a buffer that the library itself has chosen.
             warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
-            classes = own_classes(algorithm, spec.gym_packages)
-            agent: BaseAlgorithm = load_model(
-                _loadable(algorithm), content, env, classes=classes, **replaced
-            )
-        agent.__class__ = algorithm
-        return agent
+            classes = _own_classes(algorithm, spec.gym_packages)
+            return load_model(algorithm, content, env, classes=classes, **replaced)  # type: ignore[no-any-return]
     except UserError:
         raise
     except Exception as error:  # a file of another agent can fail anywhere in the library
         key, way_out = getattr(error, "key", None), ""
         if key in ("policy_class", "policy_kwargs", "replay_buffer_class", "rollout_buffer_class"):
             way_out = "; to admit a class of yours, name its module: --gym-packages MODULE"
-        elif key in constructor_parameters(algorithm):
+        elif key in arguments_of(spec.algo):
             way_out = f"; train.py -i continues with another value: -params {key}:VALUE"
         what = f"{path} cannot be loaded as a {spec.algo} agent: {one_line(error)}"
         raise UserError(f"{what}{way_out}") from error
@@ -336,50 +273,33 @@ def _has_own_load(algorithm: type[BaseAlgorithm]) -> bool:
     return own.__func__ is not vars(BaseAlgorithm)["load"].__func__
 
 
-def _loadable(algorithm: Any) -> Any:
-    """The class, or one whose constructor takes what the library's `load` passes."""
-    passed = {"policy", "device", "_init_setup_model"}
-    taken = constructor_parameters(algorithm).keys()
-    if passed <= taken:
-        return algorithm
-
-    def without(self: Any, **kwargs: Any) -> None:
-        # `load` sets up after it has restored the attributes.
-        self._setup_model = lambda: None
-        algorithm.__init__(self, **{key: kwargs[key] for key in kwargs.keys() & taken})
-        del self._setup_model
-
-    return type(algorithm.__name__, (algorithm,), {"__init__": without})
-
-
-def own_classes(algorithm: type[BaseAlgorithm], typed: list[str]) -> Mapping[str, type]:
+def _own_classes(algorithm: type[BaseAlgorithm], typed: list[str]) -> Mapping[str, type]:
     """The user's networks, optimizers and buffers, by their full names; no other classes."""
     from stable_baselines3.common.buffers import BaseBuffer
     from torch import nn, optim
 
-    from rl_yardstick.pipeline.modules import module_name
-
+    kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     homes = tuple(f"{home}." for home in (*map(module_name, typed), algorithm.__module__))
     modules = [one for name, one in list(sys.modules.items()) if f"{name}.".startswith(homes)]
     values = [value for module in modules for value in list(vars(module).values())]
-    kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     classes = [one for one in values if isinstance(one, type) and issubclass(one, kinds)]
-    own = [one for one in classes if f"{one.__module__}.".startswith(homes)]
-    return {f"{one.__module__}.{one.__qualname__}": one for one in own}
+    named = {f"{one.__module__}.{one.__qualname__}": one for one in classes}
+    return {name: one for name, one in named.items() if name.startswith(homes)}
 
 
 # --- statistics, and training further -------------------------------------------------------------
 
 
-def _normalising(spec: TrainSpec, statistics: Path | None) -> TrainSpec:
-    """The spec with environments in a VecNormalize with the settings of its statistics."""
+def _as_saved(spec: TrainSpec, data: Mapping[str, Any], statistics: Path | None) -> TrainSpec:
+    """The spec with the masks and the VecNormalize of a model that was saved."""
+    if data.get("mask_actions") is True:
+        spec = spec.changed(algorithm={"mask_actions": True, **spec.algorithm})
     if statistics is None:
         return spec
-    settings = {**_read_statistics(statistics).settings}
-    settings.pop("training", None)
+    settings = _read_statistics(statistics).settings
     # NumPy's numbers become Python's.
     plain = {key: getattr(value, "item", lambda v=value: v)() for key, value in settings.items()}
-    kept = {key: value for key, value in plain.items() if value is not None}
+    kept = {key: value for key, value in plain.items() if value is not None and key != "training"}
     return spec.changed(normalize={**kept, **(spec.normalize or {})})
 
 
@@ -400,34 +320,29 @@ def take_statistics(env: Any, path: Path) -> None:
     if inside is None:
         raise UserError(f"{path}: the environments here are not normalised")
     if inside.norm_obs and saved.settings["norm_obs"]:
-
-        def shapes(rms: Any) -> Any:
-            is_dict = isinstance(rms, dict)
-            return {key: shapes(rms[key]) for key in rms} if is_dict else rms.mean.shape
-
-        kinds = [shapes(inside.obs_rms), shapes(saved.obs_rms)]
-        if kinds[0] != kinds[1]:
-            raise UserError(
-                f"{path} holds statistics of observations of shape {kinds[1]}; the environment "
-                f"gives {kinds[0]}"
-            )
+        given = [
+            rms if isinstance(rms, dict) else {"": rms} for rms in (saved.obs_rms, inside.obs_rms)
+        ]
+        there, here = ({key: one.mean.shape for key, one in rms.items()} for rms in given)
+        if here != there:
+            fault = f"holds statistics of observations of shape {there.get('', there)}"
+            raise UserError(f"{path} {fault}; the environment gives {here.get('', here)}")
         inside.obs_rms = saved.obs_rms
     inside.ret_rms = saved.ret_rms
 
 
 def begun_with(spec: TrainSpec) -> TrainSpec:
     """The spec of a training that begins with an agent, with its masks and its normalisation."""
-    if spec.trained_agent is None:
-        return spec
-    path = Path(spec.trained_agent)
-    if zip_data(path).get("mask_actions") is True:
-        spec = spec.changed(algorithm={"mask_actions": True, **spec.algorithm})
-    return _normalising(spec, statistics_of(path))
+    path = Path(spec.trained_agent or "")
+    return _as_saved(spec, zip_data(path), statistics_of(path))
 
 
 def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorithm:
     """The agent of ``spec.trained_agent`` on its new environments, with its replay buffer."""
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+    from rl_yardstick.agents.library import MaskedReplayBuffer
+    from rl_yardstick.safe_files.buffers_and_statistics import load_replay_buffer
 
     path = Path(spec.trained_agent or "")
     # The networks come from the file, so these arguments cannot apply.
@@ -438,28 +353,18 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
     agent = load(spec, path, env, **given)
     if (statistics := statistics_of(path)) is not None and agent.get_vec_normalize_env():
         take_statistics(env, statistics)
-    if (buffer := replay_buffer_of(path)) is not None and isinstance(agent, OffPolicyAlgorithm):
-        _load_replay_buffer(agent, buffer)
-    return agent
-
-
-def _load_replay_buffer(agent: Any, path: Path) -> None:
-    from rl_yardstick.agents.library import MaskedReplayBuffer
-    from rl_yardstick.safe_files.buffers_and_statistics import load_replay_buffer
-
-    wanted = agent.replay_buffer
-    content = io.BytesIO(read_bytes(path, MAX_MODEL))
+    buffer = replay_buffer_of(path)
+    if buffer is None or not isinstance(agent, OffPolicyAlgorithm):
+        return agent
+    content, wanted = io.BytesIO(read_bytes(buffer, MAX_MODEL)), agent.replay_buffer
     try:
         load_replay_buffer(agent, content, classes={MaskedReplayBuffer, type(wanted)})
     except (ValueError, AssertionError) as error:
-        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
-    buffer = agent.replay_buffer
-    if buffer.n_envs != agent.n_envs:
-        raise UserError(
-            f"{path} was filled by {buffer.n_envs} environments at once: give "
-            f"-params n_envs:{buffer.n_envs}"
-        )
-    kinds = [(type(one).__name__, getattr(one, "n_steps", 1)) for one in (buffer, wanted)]
-    if kinds[0] != kinds[1]:
-        found, needed = (f"{name} with n_steps {n_steps}" for name, n_steps in kinds)
-        raise UserError(f"{path} holds a {found}; these hyperparameters need a {needed}")
+        raise UserError(f"{buffer} cannot be read: {one_line(error)}") from error
+    found, needed = (
+        f"{type(one).__name__} of n_envs:{one.n_envs} and n_steps:{getattr(one, 'n_steps', 1)}"
+        for one in (agent.replay_buffer, wanted)
+    )
+    if found != needed:
+        raise UserError(f"{buffer} holds a {found}; these hyperparameters need a {needed}")
+    return agent

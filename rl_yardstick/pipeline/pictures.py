@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def draw(folder: Path, parts: Any) -> None:
-    """Draw what a training has left into its folder; ``parts`` are its `Parts`, at its end."""
+    """Draw what a training has left into its folder; ``parts`` is the `Training`, at its end."""
     spec, evaluation, agent = parts.spec, parts.evaluation, parts.agent
     if not spec.pictures:
         return

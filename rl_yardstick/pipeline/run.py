@@ -56,23 +56,18 @@ class Stop:
 
 
 class Run:
-    """A run folder, held by this process while the ``with`` statement lasts.
-
-    Attributes:
-        path: ``<log folder>/<algo>/<env>_<n>``.
-        console: where progress and results are printed.
-        stop: asked between two pieces of work whether to go on.
-        is_new: whether this process has made the folder.
-        has_begun: whether the agent is about to take steps; a new run without any leaves no folder.
-    """
+    """A run folder, held by this process while the ``with`` statement lasts."""
 
     def __init__(
         self, path: Path, console: Console | None = None, stop: Stop | None = None
     ) -> None:
-        self.path = path
+        self.path = path  # <log folder>/<algo>/<env>_<n>
+        self.state_path = path / STATE  # from which the training can go on
+        self.best_model_path = path / "best_model.zip"  # of the agent that evaluated best
         self.console = console or Console(quiet=True)
-        self.stop = stop or Stop()
-        self.is_new = self.has_begun = False
+        self.stop = stop or Stop()  # asked between two pieces of work whether to go on
+        self.is_new = False  # whether this process has made the folder
+        self.has_begun = False  # about to take steps; a new run without any leaves no folder
         self._lock = FileLock(path / LOCK, timeout=0)
 
     @classmethod
@@ -80,15 +75,15 @@ class Run:
         """Make the next free folder of an agent on an environment; ``mkdir`` decides who has it."""
         parent = folder / spec.algo
         parent.mkdir(parents=True, exist_ok=True)
-        number = max((n for n, _ in numbered_runs(parent, spec.env_name)), default=0) + 1
+        number = max((n for n, _ in numbered_runs(parent, spec.env_name)), default=0)
         while True:
+            number += 1
+            path = parent / f"{spec.env_name}_{number}{suffix}"
             with suppress(FileExistsError):
-                path = parent / f"{spec.env_name}_{number}{suffix}"
                 path.mkdir()
                 run = cls(path, **kwargs)
                 run.is_new = True
                 return run
-            number += 1
 
     def __enter__(self) -> Self:
         try:
@@ -110,30 +105,15 @@ class Run:
 
     # --- files ------------------------------------------------------------------------------------
 
-    @property
-    def state_path(self) -> Path:
-        """The state from which the training can go on."""
-        return self.path / STATE
-
-    @property
-    def best_model_path(self) -> Path:
-        """The zip of the agent that evaluated best."""
-        return self.path / "best_model.zip"
-
-    def settings_path(self, spec: TrainSpec) -> Path:
-        """The folder of rl_zoo3's settings files, and of VecNormalize's statistics."""
-        return self.path / spec.env_name
-
     def model_path(self, spec: TrainSpec) -> Path:
         """The zip of the agent at the end."""
         return self.path / f"{spec.env_name}.zip"
 
     def checkpoints(self) -> dict[int, Path]:
         """The checkpoints by their steps, in rising order."""
-        return dict(sorted((int(p.stem.split("_")[2]), p) for p in self._named_checkpoints()))
-
-    def _named_checkpoints(self) -> list[Path]:
-        return [p for p in self.path.iterdir() if re.fullmatch(r"rl_model_\d+_steps\.zip", p.name)]
+        form = re.compile(r"rl_model_(\d+)_steps\.zip")
+        named = [(form.fullmatch(path.name), path) for path in self.path.iterdir()]
+        return dict(sorted((int(match[1]), path) for match, path in named if match))
 
     def recorded(self) -> dict[str, Any]:
         """The content of ``run.json``; empty if there is none yet."""
@@ -142,26 +122,25 @@ class Run:
         return data if isinstance(data, dict) else {}
 
     def spec(self) -> TrainSpec:
-        """The spec in ``run.json``, which is data.
-
-        Raises:
-            UserError: if there is none.
-        """
-        return spec_in(self.recorded(), self.path)
+        """The spec in ``run.json``, which is data; UserError if there is none."""
+        try:
+            return TrainSpec.model_validate(self.recorded()["spec"])
+        except (ValidationError, LookupError, TypeError) as error:
+            fault = f"is no run folder of this version: {RECORD} has no spec"
+            raise UserError(f"{self.path} {fault}") from error
 
     def begin(self, spec: TrainSpec, args: Mapping[str, Any], command: str) -> None:
         """Write what the run is about to do: settings for rl_zoo3, and ``run.json``."""
         import yaml
 
-        def text(data: Mapping[str, Any]) -> str:
-            plain = json.loads(json.dumps(data, default=str))  # no paths
-            return str(yaml.dump(plain, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
-
-        settings = self.settings_path(spec)
+        settings = self.path / spec.env_name
         settings.mkdir(exist_ok=True)
-        write_text(settings / "config.yml", text(spec.hyperparams))
         # rl_zoo3's tools use env_kwargs in args.yml before those in config.yml.
-        write_text(settings / "args.yml", text({**args, "env_kwargs": spec.env_kwargs or None}))
+        args = {**args, "env_kwargs": spec.env_kwargs or None}
+        for name, data in (("config.yml", spec.hyperparams), ("args.yml", args)):
+            plain = json.loads(json.dumps(data, default=str))  # no paths
+            text = yaml.dump(plain, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper))
+            write_text(settings / name, text)
         write_text(settings / "command.txt", f"{command}\n")
         self.record(spec, RUNNING)
 
@@ -171,16 +150,17 @@ class Run:
         facts = {"versions": versions(), "machine": machine(), "pid": os.getpid()}
         write_json(self.path / RECORD, {**known, **facts, **figures})
 
-    def save(self, agent: Any, path: Path) -> None:
-        """Save an agent's zip whole or not at all, and the statistics of its VecNormalize."""
-        from rl_yardstick.pipeline.finite_numbers import check_model
 
-        check_model(agent)
-        with replacing(path) as beside:
-            agent.save(beside)
-        if (statistics := agent.get_vec_normalize_env()) is not None:
-            with replacing(statistics_beside(path)) as beside:
-                statistics.save(str(beside))
+def save_agent(agent: Any, path: Path) -> None:
+    """Save an agent's zip whole or not at all, and the statistics of its VecNormalize."""
+    from rl_yardstick.pipeline.finite_numbers import check_model
+
+    check_model(agent)
+    with replacing(path) as beside:
+        agent.save(beside)
+    if (statistics := agent.get_vec_normalize_env()) is not None:
+        with replacing(statistics_beside(path)) as beside:
+            statistics.save(str(beside))
 
 
 def statistics_beside(model: Path) -> Path:
@@ -199,12 +179,17 @@ def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:
     return sorted((int(match[1]), path) for match, path in names if match)
 
 
-def spec_in(recorded: Mapping[str, Any], path: Path) -> TrainSpec:
-    """The spec in the content of a ``run.json``."""
-    try:
-        return TrainSpec.model_validate(recorded["spec"])
-    except (ValidationError, LookupError, TypeError) as error:
-        raise UserError(f"{path} is no run folder of this version: {RECORD} has no spec") from error
+def resumable(path: Path) -> TrainSpec:
+    """The spec of a run; UserError if it has finished, or if versions and so bits would differ."""
+    run = Run(path)
+    spec, recorded = run.spec(), run.recorded()
+    if recorded.get("state") == FINISHED:
+        raise UserError(f"{path} is finished already")
+    begun_with = recorded.get("versions", {}) if run.state_path.exists() else versions()
+    for name, version in versions().items():
+        if (was := begun_with.get(name)) != version:
+            raise UserError(f"{path} was begun with {name} {was}, here is {version}")
+    return spec
 
 
 @cache
@@ -219,29 +204,9 @@ def versions() -> dict[str, str]:
 @cache
 def machine() -> dict[str, str]:
     """Hardware that may affect times and the bits of networks; does not identify the machine."""
-    processor = platform.processor() or platform.machine()
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                processor = line.partition(":")[2].strip()
-                break
+    listed = Path("/proc/cpuinfo")
+    text = listed.read_text(encoding="utf-8") if listed.exists() else ""
+    named = re.search(r"model name\s*:(.*)", text)
+    processor = named[1].strip() if named else platform.processor() or platform.machine()
     system = f"{platform.system()} {platform.release()}, {platform.machine()}"
     return {"processor": processor, "cores": str(os.cpu_count() or ""), "system": system}
-
-
-def resumable(path: Path) -> TrainSpec:
-    """The spec of an unfinished run.
-
-    Raises:
-        UserError: if it has finished, or other versions would give other bits.
-    """
-    run = Run(path)
-    recorded = run.recorded()
-    spec = spec_in(recorded, path)
-    if recorded.get("state") == FINISHED:
-        raise UserError(f"{path} is finished already")
-    for name, version in versions().items() if run.state_path.exists() else ():
-        was = recorded.get("versions", {}).get(name)
-        if was != version:
-            raise UserError(f"{path} was begun with {name} {was}, here is {version}")
-    return spec

@@ -10,18 +10,18 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.pipeline.arguments import arguments_of, check_arguments, check_keywords
-from rl_yardstick.pipeline.errors import UserError, did_you_mean, shown, unknown
+from rl_yardstick.pipeline.components import AUTO, WRAPPERS, arguments_of, check_arguments
+from rl_yardstick.pipeline.errors import UserError, shown, unknown
 from rl_yardstick.pipeline.files import read_text
-from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec, validated
 
 HYPERPARAMS = Path(__file__).resolve().parents[1] / "hyperparams"
 TUNED_ON = "tuned_on"
@@ -33,11 +33,9 @@ SPECIAL = (*BUDGETS, *COMPONENTS, *ENV_KWARGS, *_OTHERS)
 # What rl_zoo3's files have and what is decided elsewhere here.
 _SET_ELSEWHERE = {
     "action_noise": "noise_type and noise_std",
-    "seed": "--seed",
-    "device": "--device",
-    "verbose": "--verbose",
     "tensorboard_log": "--tensorboard-log",
 }
+_SET_ELSEWHERE |= {"seed": "--seed", "device": "--device", "verbose": "--verbose"}
 _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 
 
@@ -45,7 +43,7 @@ _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Plain values only; the same key twice is a mistake."""
+    """Plain values, and rl_zoo3's ordered mappings and tuples; no key may be there twice."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys = [key.value for key, _ in node.value if key.value != "<<"]  # before they are merged
@@ -57,12 +55,18 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         return found
 
 
-def read_yaml(path: Path) -> Any:
-    """The plain values in a YAML file.
+_PYTHON = "tag:yaml.org,2002:python"
+_Loader.add_constructor(
+    f"{_PYTHON}/tuple", lambda loader, node: loader.construct_sequence(node, deep=True)
+)
+_Loader.add_constructor(
+    f"{_PYTHON}/object/apply:collections.OrderedDict",
+    lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0]),
+)
 
-    Raises:
-        UserError: if it cannot be read, or asks for objects.
-    """
+
+def read_yaml(path: Path) -> Any:
+    """The plain values in a YAML file; UserError if it cannot be read, or asks for objects."""
     return parse_yaml(read_text(path), str(path))
 
 
@@ -70,18 +74,31 @@ def parse_yaml(text: str, where: str) -> Any:
     """The plain values that a text in YAML spells."""
     try:
         return yaml.load(text, Loader=_Loader)  # noqa: S506  # a safe loader
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{where} is no valid YAML: {' '.join(str(error).split())}") from error
 
 
-def read_entries(path: Path) -> dict[str, Any]:
-    """All entries of a file of hyperparameters, with ``tuned_on``."""
+def _check_names(found: Any, words: str) -> dict[str, Any]:
+    """The value, which must be a mapping of names."""
+    if not (isinstance(found, dict) and all(isinstance(key, str) for key in found)):
+        raise UserError(words)
+    return found
+
+
+def read_saved(path: Path) -> dict[str, Any]:
+    """The settings in a run folder of this project or of rl_zoo3."""
+    found = _check_names(read_yaml(path), f"{path} must map names to values")
+    return {key: _read_dict(value) for key, value in found.items()}
+
+
+def _read_file(algo: str, path: Path | None) -> dict[str, Any] | None:
+    """All entries of an agent's shipped file, or of another one; None if none is shipped."""
+    path = path or HYPERPARAMS / f"{algo}.yml"
+    if path.parent == HYPERPARAMS and not path.is_file():
+        return None
     if path.suffix == ".py":
         raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
-    entries = read_yaml(path)
-    if not (isinstance(entries, dict) and all(isinstance(key, str) for key in entries)):
-        raise UserError(f"{path} must map environment ids to hyperparameters")
-    return entries
+    return _check_names(read_yaml(path), f"{path} must map environment ids to hyperparameters")
 
 
 def read_entry(
@@ -89,25 +106,25 @@ def read_entry(
 ) -> dict[str, Any]:
     """The entry of an environment in ``hyperparams/<algo>.yml``, or in another file.
 
-    Atari games without an entry use the entry ``atari``, all others ``default``. An agent without
-    a file, such as the user's own, has an empty entry. If ``env_kwargs`` make the environment equal
-    to another id, that id's entry is used: for CliffWalking-v1 with ``is_slippery: True``, the
-    entry of CliffWalkingSlippery-v1.
+    Atari games without an entry use the entry ``atari``, all others ``default``; an agent without
+    a file an empty one. If ``env_kwargs`` make the environment equal to another id, that id's entry
+    is used: for CliffWalking-v1 with ``is_slippery: True``, the entry of CliffWalkingSlippery-v1.
     """
-    if path is None and not (HYPERPARAMS / f"{algo}.yml").is_file():
+    from gymnasium import registry
+
+    if (entries := _read_file(algo, path)) is None:
         return {}
+    key, own = _key(entries, env_id), registry.get(env_id)
     path = path or HYPERPARAMS / f"{algo}.yml"
-    entries = read_entries(path)
-    key = _same_environment(entries, env_id, env_kwargs) or _key(entries, env_id)
+    if env_kwargs and own is not None:
+        meant = own.entry_point, {**own.kwargs, **env_kwargs}, own.max_episode_steps
+        named = [registry[name] for name in entries if name in registry]
+        same = [s.id for s in named if (s.entry_point, s.kwargs, s.max_episode_steps) == meant]
+        key = same[0] if same else key
     if key is None:
-        hint = did_you_mean(env_id, entries, n=3)
-        raise UserError(
-            f"{path}: no entry for {shown(env_id)}{' (' + hint + ')' if hint else ''}; "
-            "give hyperparameters with -params, or another file with --conf-file"
-        )
-    entry = entries[key]
-    if not (isinstance(entry, dict) and all(isinstance(name, str) for name in entry)):
-        raise UserError(f"{path}: the entry {key} must map names to values")
+        way_out = "give hyperparameters with -params, or another file with --conf-file"
+        raise UserError(f"{unknown(f'{path}: no entry for', env_id, entries, n=3)}; {way_out}")
+    entry = _check_names(entries[key], f"{path}: the entry {key} must map names to values")
     return {name: _read_dict(value) for name, value in entry.items()}
 
 
@@ -116,42 +133,18 @@ def _key(entries: Mapping[str, Any], env_id: str) -> str | None:
     return next((name for name in names if name in entries), None)
 
 
-def _same_environment(
-    entries: Mapping[str, Any], env_id: str, env_kwargs: Mapping[str, Any] | None
-) -> str | None:
-    """The id of an entry that is registered as this environment with the same arguments."""
-    from gymnasium import registry
-
-    own = registry.get(env_id)
-    if not env_kwargs or own is None:
-        return None
-    meant = own.entry_point, {**own.kwargs, **env_kwargs}, own.max_episode_steps
-    named = (registry[name] for name in entries if name in registry)
-    return next(
-        (one.id for one in named if (one.entry_point, one.kwargs, one.max_episode_steps) == meant),
-        None,
-    )
-
-
 def seeds_tuned_on(algo: str, env_id: str, path: Path | None = None) -> tuple[range, ...] | None:
     """The seeds on which an environment's entry was tuned; None if its file does not say."""
-    shipped = HYPERPARAMS / f"{algo}.yml"
-    if path is None and not shipped.is_file():
-        return None
-    entries = read_entries(path or shipped)
-    if TUNED_ON not in entries:
-        return () if path is None else None
-    where = f"{path or shipped}: {TUNED_ON}"
-    seeds = entries[TUNED_ON]
+    entries = _read_file(algo, path)
+    if entries is None or TUNED_ON not in entries:
+        return None if entries is None or path is not None else ()
     try:
-        given = seeds.get(_key(entries, env_id) or "", [])
-        ranges = [
-            (one["first"], one["count"]) for one in (given if type(given) is list else [given])
-        ]
-        return tuple(range(first, first + count) for first, count in ranges)
+        given = entries[TUNED_ON].get(_key(entries, env_id) or "", [])
+        ranges = given if type(given) is list else [given]
+        return tuple(range(one["first"], one["first"] + one["count"]) for one in ranges)
     except (AttributeError, LookupError, TypeError) as error:
-        form = "entries to seeds such as {first: 0, count: 10}"
-        raise UserError(f"{where} must map {form}") from error
+        form = "must map entries to seeds such as {first: 0, count: 10}"
+        raise UserError(f"{path or algo}: {TUNED_ON} {form}") from error
 
 
 def entry_names(algo: str) -> list[str]:
@@ -169,11 +162,10 @@ def entry_names(algo: str) -> list[str]:
 def parse_assignments(texts: Iterable[str], flag: str) -> dict[str, Any]:
     """The values of ``name:literal`` words, such as ``gamma:0.9 policy_kwargs:dict(...)``."""
     found: dict[str, Any] = {}
-    words = list(texts)
-    for place, text in enumerate(words):
+    for text in texts:
         name, colon, value = text.partition(":")
         if not (colon and name.isidentifier() and value.strip()):
-            hint = _meant(words[place:])
+            hint = f": did you mean {text.replace('=', ':', 1)}?" if "=" in text else ""
             raise UserError(f"{flag}: {shown(text)} is not of the form name:value{hint}")
         if name in found:
             raise UserError(f"{flag}: {shown(name)} is given twice")
@@ -181,27 +173,13 @@ def parse_assignments(texts: Iterable[str], flag: str) -> dict[str, Any]:
     return found
 
 
-def _meant(words: Sequence[str]) -> str:
-    """A hint for ``name=value``, ``name value``, ``name = value`` and ``name: value``."""
-    name, *others = [*words[0].split("=", 1), *words[1:3]]
-    name = name.rstrip(":")
-    value = next(filter(None, (other.lstrip("=") for other in others)), "")
-    is_name = name.isidentifier() and value and ":" not in value
-    return f": did you mean {name}:{value}?" if is_name else ""
-
-
 def literal(text: str) -> Any:
     """The literal of Python or YAML that a text spells, also as ``dict(...)``; or else the text."""
-    try:
+    with suppress(SyntaxError, ValueError, RecursionError, MemoryError):
         return _literal(ast.parse(text.strip(), mode="eval").body)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        pass
-    # YAML has more literals, such as {a: 1}.
-    if text.strip().startswith(("[", "{")):
-        try:
+    if text.strip().startswith(("[", "{")):  # YAML has more literals, such as {a: 1}
+        with suppress(UserError):
             return parse_yaml(text, text)
-        except UserError:
-            pass
     return text
 
 
@@ -255,62 +233,24 @@ def training_follows(
 def check_agent(algo: str) -> None:
     """Raise UserError if there is no such agent, or a package that it needs is missing."""
     entry = ALGORITHMS.get(algo)
-    if entry is None and algo.lower() == "her":
-        raise UserError(
-            "hindsight experience replay is no agent but a replay buffer, for environments with "
-            "goals: --algo sac -params replay_buffer_class:HerReplayBuffer policy:MultiInputPolicy"
-        )
     if entry is None:
         raise unknown("unknown agent", algo, ALGORITHMS)
     if not entry.is_installed:
-        raise UserError(
-            f"{algo} needs {entry.package}, which is not installed: {entry.install_command}"
-        )
+        fault = f"{entry.package}, which is not installed: {entry.install_command}"
+        raise UserError(f"{algo} needs {fault}")
 
 
-def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -> TrainSpec:
-    """The spec of an entry, with numbers in place of ``auto``.
-
-    Args:
-        algo: the agent.
-        env_id: the environment, which is registered.
-        entry: its hyperparameters.
-        fields: other fields of `TrainSpec`.
-
-    Raises:
-        UserError: for an agent, a key or a value that does not exist or does not fit.
-    """
-    from rl_yardstick.pipeline.auto import resolved
-
-    check_agent(algo)
-    entry = {key: _read_dict(value) for key, value in entry.items() if value is not None}
-    if all(entry.get(budget) is not None for budget in BUDGETS):
-        raise UserError("give n_timesteps or n_episodes, not both")
-    # Without noise_type, noise_std is an argument of some agents.
-    keys = [key for key in SPECIAL if key != "noise_std" or "noise_type" in entry]
-    special = {key: entry[key] for key in keys if key in entry}
-    rest = {key: value for key, value in entry.items() if key not in keys}
-    for key in rest:
-        if key in _SET_ELSEWHERE:
-            raise UserError(f"{key} is set by {_SET_ELSEWHERE[key]}, not here")
-        if key not in arguments_of(algo):
-            raise unknown(f"{algo} has no hyperparameter", key, [*arguments_of(algo), *SPECIAL])
+def special_settings(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a spec that the special keys of an entry give."""
+    special = {key: entry[key] for key in SPECIAL if entry.get(key) is not None}
     for key in COMPONENTS:
-        special[key] = components(special.get(key), key)
+        special[key] = _components(special.get(key), key)
     if isinstance(special.get("normalize"), bool):
         special["normalize"] = {} if special["normalize"] else None
-    for key in ("normalize", "monitor_kwargs"):
-        if special.get(key) is not None:
-            special[key] = check_keywords(key, special[key])
-    algorithm = check_arguments(algo, rest)
-    if special.get("normalize") is not None and isinstance(algorithm.get("gamma"), float):
-        # As in rl_zoo3, rewards are normalised with the agent's discount.
-        special["normalize"].setdefault("gamma", algorithm["gamma"])
-    found = {"algo": algo, "env_id": env_id, "algorithm": algorithm, **special, **fields}
-    return resolved(found)
+    return special
 
 
-def components(value: Any, where: str) -> list[dict[str, Any]]:
+def _components(value: Any, where: str) -> list[dict[str, Any]]:
     """Wrappers or callbacks in rl_zoo3's forms: a name, ``{name: kwargs}``, or a list of these."""
     found: list[dict[str, Any]] = []
     for item in value if isinstance(value, list) else [] if value is None else [value]:
@@ -322,6 +262,47 @@ def components(value: Any, where: str) -> list[dict[str, Any]]:
         else:
             raise UserError(f"{where}: {shown(item)} is no class name with arguments")
     return found
+
+
+def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -> TrainSpec:
+    """The spec of an entry, with numbers in place of ``auto``; its ``origins`` tell how.
+
+    ``fields`` are other fields of `TrainSpec`. Raises UserError for an agent, a key or a value that
+    does not exist or does not fit.
+    """
+    check_agent(algo)
+    entry = {key: _read_dict(value) for key, value in entry.items() if value is not None}
+    if all(budget in entry for budget in BUDGETS):
+        raise UserError("give n_timesteps or n_episodes, not both")
+    special = special_settings(entry)
+    if "noise_type" not in entry:  # then noise_std is an argument of some agents
+        special.pop("noise_std", None)
+    rest = {key: value for key, value in entry.items() if key not in special}
+    for key in rest:
+        if key in _SET_ELSEWHERE:
+            raise UserError(f"{key} is set by {_SET_ELSEWHERE[key]}, not here")
+        if key not in arguments_of(algo):
+            raise unknown(f"{algo} has no hyperparameter", key, [*arguments_of(algo), *SPECIAL])
+    for key in WRAPPERS:
+        if special.get(key) is not None:
+            special[key] = check_arguments(key, special[key], f"{key}: ")
+    algorithm = check_arguments(algo, rest)
+    if special.get("normalize") is not None and isinstance(algorithm.get("gamma"), float):
+        # As in rl_zoo3, rewards are normalised with the agent's discount.
+        special["normalize"].setdefault("gamma", algorithm["gamma"])
+    asked = [key for key in AUTO if algorithm.get(key) == "auto"]
+    plain = {key: value for key, value in algorithm.items() if key not in asked}
+    if str(special.get("n_timesteps")).startswith("auto"):
+        asked.insert(0, str(special.pop("n_timesteps")))
+    found = {"algo": algo, "env_id": env_id, "algorithm": plain, **special, **fields}
+    spec = validated(found)
+    if any("auto" in wrapper.kwargs.values() for wrapper in spec.train_env_wrapper):
+        spec = _with_rewards(spec)
+    if asked:
+        spec = _with_numbers(spec, asked)
+    if not (spec.n_timesteps or spec.n_episodes):
+        raise UserError("the training has no budget: give -n STEPS or --n-episodes N")
+    return spec
 
 
 # Settings of the task: a run's shipped settings are those for its own task.
@@ -344,28 +325,87 @@ def shipped_hyperparams(spec: TrainSpec) -> dict[str, Any]:
     return {key: value for key, value in entry.items() if not str(value).startswith("auto")}
 
 
-class _SavedLoader(_Loader):
-    """Also reads what rl_zoo3 writes into run folders: ordered mappings and tuples."""
+# --- the values of ``auto``, which follow from the environment's size and rewards ----------------
+
+# With gamma, a reward one time limit ahead has the weight 0.6.
+
+STEPS_PER_PAIR, FEWEST_PAIRS = 2500, 100  # training steps per state and action
+VISITS_AVERAGED = 10  # a step size of 1 / n averages over about the last n visits
+FIRST_STEP_SIZE, LAST_STEP_SIZES = 0.3, (0.003, 0.05)
+_STEPS = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
 
-def _mapping(loader: Any, node: Any) -> dict[str, Any]:
-    ((pairs,),) = [loader.construct_sequence(node, deep=True)]
-    return dict(pairs)
+def _with_numbers(spec: TrainSpec, asked: list[str]) -> TrainSpec:
+    """Settings of tables, from the evaluation environment."""
+    from gymnasium.spaces import Discrete
+
+    from rl_yardstick.envs.known_models import time_limit, transition_model
+    from rl_yardstick.pipeline.environments import check_fit, make_single_env
+
+    check_fit(spec)
+    where, n_timesteps = f"{spec.algo} on {spec.env_id}", spec.n_timesteps
+    origins, algorithm = dict(spec.origins), dict(spec.algorithm)
+    with closing(make_single_env(spec)) as env:
+        spaces = env.observation_space, env.action_space
+        counts = [int(space.n) for space in spaces if isinstance(space, Discrete)]
+        if len(counts) < 2:
+            raise UserError(f"{where}: auto needs Discrete observations and actions")
+        n_pairs = counts[0] * counts[1]
+        for key in asked:
+            if key.startswith("auto"):
+                if (match := _STEPS.fullmatch(key)) is None:
+                    form = "auto, or auto_1000 with the steps for each pair of state and action"
+                    raise UserError(f"n_timesteps: {key!r} is not {form}")
+                per_pair, pairs = int(match[1] or STEPS_PER_PAIR), max(n_pairs, FEWEST_PAIRS)
+                n_timesteps = per_pair * pairs
+                size = "{:,} states and {:,} actions".format(*counts)
+                least = f", counted as {pairs} pairs" if pairs > n_pairs else ""
+                origins["n_timesteps"] = f"auto: {per_pair:,} for each pair of {size}{least}"
+            elif key == "gamma":
+                if (limit := time_limit(env)) is None:
+                    raise UserError(f"{where}: gamma: auto needs an environment with a time limit")
+                algorithm[key] = round(1 - 1 / (2 * limit), 7)
+                origins[key] = f"auto: 1 - 1/(2 x time limit of {limit:,})"
+            elif key == "learning_rate":
+                low, high = LAST_STEP_SIZES
+                last = VISITS_AVERAGED * n_pairs / n_timesteps if n_timesteps else high
+                algorithm[key] = f"exp_{FIRST_STEP_SIZE:g}_{min(max(last, low), high):.2g}"
+                rule = f"ends at {VISITS_AVERAGED} x states x actions / steps"
+                origins[key] = f"auto: {rule}, within {low} and {high}" if n_timesteps else "auto"
+            else:
+                model = transition_model(env)
+                if model is None or not (ends := model.terminated & (model.prob > 0)).any():
+                    needed = "a known model whose episodes can end"
+                    raise UserError(f"{where}: {key}: auto needs {needed}")
+                algorithm[key] = float(model.reward[ends].max())
+                origins[key] = "auto: the highest reward that ends an episode"
+    return spec.changed(n_timesteps=n_timesteps, algorithm=algorithm, origins=origins)
 
 
-_PYTHON = "tag:yaml.org,2002:python"
-_SavedLoader.add_constructor(f"{_PYTHON}/object/apply:collections.OrderedDict", _mapping)
-_SavedLoader.add_constructor(
-    f"{_PYTHON}/tuple", lambda loader, node: loader.construct_sequence(node, deep=True)
-)
+def _with_rewards(spec: TrainSpec) -> TrainSpec:
+    """The arguments of training wrappers, from the rewards that reach them."""
+    from rl_yardstick.envs.known_models import transition_model
+    from rl_yardstick.pipeline.environments import make_single_env
 
-
-def read_saved(path: Path) -> dict[str, Any]:
-    """The settings in a run folder of this project or of rl_zoo3."""
-    try:
-        found = yaml.load(read_text(path), Loader=_SavedLoader)  # noqa: S506  # a safe loader
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise UserError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from error
-    if not (isinstance(found, dict) and all(isinstance(key, str) for key in found)):
-        raise UserError(f"{path} must map names to values")
-    return {key: _read_dict(value) for key, value in found.items()}
+    wrappers, told = list(spec.train_env_wrapper), []
+    for place, wrapper in enumerate(wrappers):
+        kwargs = dict(wrapper.kwargs)
+        for key in [key for key in ("scale", "min_reward") if kwargs.get(key) == "auto"]:
+            inner = spec.changed(train_env_wrapper=wrappers[:place])
+            with closing(make_single_env(inner, training=True)) as env:
+                model = transition_model(env)
+            if model is None:
+                raise UserError(f"{spec.env_id}: {key}: auto needs an environment with a model")
+            rewards = model.reward[model.prob > 0]
+            low, high = float(rewards.min()), float(rewards.max())
+            largest = max(-low, high)
+            if key == "scale":
+                kwargs[key], how = 1 / largest if largest else 1.0, "1 / the largest reward"
+            elif high <= 0 or -high / 10 < low:
+                kwargs[key], how = low, "the lowest reward"
+            else:  # large costs would teach a network to stand still
+                kwargs[key], how = -high / 10, "a tenth of the highest reward below zero"
+            told.append(f"{key} auto: {kwargs[key]:g}, {how}")
+        wrappers[place] = wrapper.model_copy(update={"kwargs": kwargs})
+    origins = {**spec.origins, "train_env_wrapper": "; ".join(told)}
+    return spec.changed(train_env_wrapper=wrappers, origins=origins)

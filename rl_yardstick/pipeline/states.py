@@ -17,6 +17,7 @@ import pickle
 import random
 import secrets
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,12 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.monitor import ResultsWriter
 
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import read_bytes, replacing
 
 MAX_STATE = 1 << 36  # bytes
-_KEPT = {"locals", "globals", "class_attributes", "results_writer", "_logger"}
+_OF_PROCESS = {"locals", "globals", "class_attributes", "results_writer", "_logger"}
 
 
 def roots_of(agent: Any, callbacks: list[BaseCallback], **process: Any) -> dict[str, Any]:
@@ -59,13 +59,17 @@ def _layers(env: Any) -> Iterator[Any]:
 
 def save_state(path: Path, roots: dict[str, Any], process: tuple[str, ...]) -> None:
     """Write the attributes of all roots and the global generators, signed."""
-    state = {
-        "roots": {name: _attributes(root) for name, root in roots.items() if name not in process},
-        "files": {n: _position(root) for n, root in roots.items() if _writer(root) is not None},
-        "generators": (random.getstate(), np.random.get_state(), th.get_rng_state()),  # noqa: NPY002
-    }
+    attributes, positions = {}, {}
+    for name, root in roots.items():
+        if name not in process:
+            left_out = _left_out(type(root))
+            attributes[name] = {k: value for k, value in vars(root).items() if k not in left_out}
+        if (writer := vars(root).get("results_writer")) is not None:  # a Monitor's open file
+            writer.file_handler.flush()
+            positions[name] = int(writer.file_handler.tell())
+    generators = random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
     stream = io.BytesIO()
-    _Pickler(stream, roots).dump(state)
+    _Pickler(stream, roots).dump((attributes, positions, generators))
     content = stream.getvalue()
     with replacing(path) as beside:
         beside.write_bytes(hmac.digest(_key(), content, "sha256") + content)
@@ -74,21 +78,21 @@ def save_state(path: Path, roots: dict[str, Any], process: tuple[str, ...]) -> N
 def load_state(path: Path, roots: dict[str, Any]) -> None:
     """Put a saved state into the roots of a training that was made with the same spec.
 
-    Raises:
-        UserError: if the state is not signed by this user.
+    Raises UserError if the state is not signed by this user.
     """
     content = read_bytes(path, MAX_STATE)
     if not hmac.compare_digest(content[:32], hmac.digest(_key(), content[32:], "sha256")):
         raise UserError(f"{path} is not signed with your key: a state of others is not loaded")
-    state = _Unpickler(io.BytesIO(content[32:]), roots).load()
-    for name, attributes in state["roots"].items():
+    unpickler: Any = pickle.Unpickler(io.BytesIO(content[32:]))  # noqa: S301  # signed
+    unpickler.persistent_load = roots.__getitem__
+    attributes, positions, (python, numpy, torch) = unpickler.load()
+    for name, saved in attributes.items():
         inside = vars(roots[name])
-        for key in inside.keys() - attributes.keys() - _left_out(type(roots[name])):
+        for key in inside.keys() - saved.keys() - _left_out(type(roots[name])):
             del inside[key]
-        inside.update(attributes)
-    for name, position in state["files"].items():
+        inside.update(saved)
+    for name, position in positions.items():
         roots[name].results_writer.file_handler.truncate(position)
-    python, numpy, torch = state["generators"]
     random.setstate(python)
     np.random.set_state(numpy)  # noqa: NPY002
     th.set_rng_state(torch)
@@ -103,36 +107,16 @@ def _key() -> bytes:
         beside = folder / f"state.key.{os.getpid()}"
         beside.touch(mode=0o600)
         beside.write_bytes(secrets.token_bytes(32))
-        try:
+        with suppress(FileExistsError):
             os.link(beside, path)  # the first of several processes wins
-        except FileExistsError:
-            pass
-        finally:
-            beside.unlink()
+        beside.unlink()
     return read_bytes(path, 1000)
 
 
 def _left_out(kind: type) -> set[str]:
     """Attributes that a class rebuilds by itself or that belong to the process."""
     own = (name for c in kind.__mro__ for name in vars(c).get("excluded_from_states", ()))
-    return _KEPT.union(own)
-
-
-def _attributes(root: Any) -> dict[str, Any]:
-    left_out = _left_out(type(root))
-    return {name: value for name, value in vars(root).items() if name not in left_out}
-
-
-def _writer(root: Any) -> ResultsWriter | None:
-    """The open ``monitor.csv`` of a Monitor."""
-    found: ResultsWriter | None = vars(root).get("results_writer")
-    return found
-
-
-def _position(root: Any) -> int:
-    file = root.results_writer.file_handler
-    file.flush()
-    return int(file.tell())
+    return _OF_PROCESS.union(own)
 
 
 class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
@@ -153,27 +137,19 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         if isinstance(obj, th.UntypedStorage):
             return _storage, (bytes(np.asarray(th.empty(0, dtype=th.uint8).set_(obj))),)
         if type(obj) is np.ndarray and obj.base is not None and not obj.dtype.hasobject:
-            base: Any = obj
-            while isinstance(base, np.ndarray) and base.base is not None:
-                base = base.base
-            address = obj.__array_interface__["data"][0]
-            if isinstance(base, np.ndarray):
-                offset = address - base.__array_interface__["data"][0]
-                return _view, (base, offset, obj.dtype, obj.shape, obj.strides)
-            if isinstance(base, th.Tensor):
-                storage = base.untyped_storage()
-                offset = address - storage.data_ptr()
-                return _view, (storage, offset, obj.dtype, obj.shape, obj.strides)
+            memory: Any = obj
+            while isinstance(memory, np.ndarray) and memory.base is not None:
+                memory = memory.base
+            offset = obj.__array_interface__["data"][0]
+            if isinstance(memory, th.Tensor):
+                memory = memory.untyped_storage()
+                offset -= memory.data_ptr()
+            elif isinstance(memory, np.ndarray):
+                offset -= memory.__array_interface__["data"][0]
+            else:
+                return super().reducer_override(obj)
+            return _view, (memory, offset, obj.dtype, obj.shape, obj.strides)
         return super().reducer_override(obj)
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, stream: io.BytesIO, roots: dict[str, Any]) -> None:
-        super().__init__(stream)
-        self.roots = roots
-
-    def persistent_load(self, name: str) -> Any:
-        return self.roots[name]
 
 
 def _storage(content: bytes) -> th.UntypedStorage:

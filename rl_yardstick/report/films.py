@@ -15,10 +15,10 @@ from PIL import Image
 
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.study import file_name
+from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.environments import MISTAKES
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.files import replacing, write_json
-from rl_yardstick.pipeline.modules import import_modules
 from rl_yardstick.pipeline.run import RECORD
 
 if TYPE_CHECKING:

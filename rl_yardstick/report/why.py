@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.modules import import_modules
 
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.explanation import Explanation, Parting, StateLoss

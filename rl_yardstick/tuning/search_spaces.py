@@ -18,7 +18,7 @@ from optuna.trial import FixedTrial, Trial
 from pydantic import ValidationError
 
 from rl_yardstick.agents import load_algorithm
-from rl_yardstick.pipeline.arguments import constructor_parameters
+from rl_yardstick.pipeline.components import constructor_parameters
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
 from rl_yardstick.pipeline.settings import COMPONENTS, HYPERPARAMS, SPECIAL, override, read_yaml
 from rl_yardstick.pipeline.spec import TrainSpec

@@ -30,7 +30,7 @@ from optuna.trial import FixedTrial, FrozenTrial
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.experiments.plan import PlannedRun, plan, specs_of
 from rl_yardstick.experiments.study import AgentSpec, layered
-from rl_yardstick.pipeline.arguments import arguments_of
+from rl_yardstick.pipeline.components import arguments_of
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import json_text
 from rl_yardstick.pipeline.settings import COMPONENTS

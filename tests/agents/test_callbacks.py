@@ -3,6 +3,7 @@
 import csv
 import json
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from rl_yardstick.agents.common.callbacks import (
     calls_until_multiple,
     members,
 )
-from rl_yardstick.pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
+from rl_yardstick.pipeline.callbacks import Checkpoint, EvaluationCallback
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.run import Run
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -94,18 +95,18 @@ def every_kind(folder, evaluated):
         evaluated.append(snapshot(model))
         return Evaluation(np.array([float(len(evaluated))]), np.array([1]), None)
 
-    run, steps, episodes = (
-        Run.claim(folder / name, TrainSpec(algo="sarsa", env_id=LAKE, n_timesteps=1))
-        for name in ("logs", "steps", "episodes")
-    )
+    run = Run.claim(folder / "logs", TrainSpec(algo="sarsa", env_id=LAKE, n_timesteps=1))
+    steps, episodes = ({"save_path": str(folder / name)} for name in ("steps", "episodes"))
+    for kwargs in (steps, episodes):
+        Path(kwargs["save_path"]).mkdir(parents=True)
     return [
         EvalCallback(env, eval_freq=90, n_eval_episodes=2, log_path=str(folder), verbose=0),
         CheckpointCallback(110, str(folder), name_prefix="library"),
         EveryNTimesteps(70, Recorder()),
         LogEveryNTimesteps(130),
         EvaluationCallback(run, env, evaluator, (55, 0)),
-        StepCheckpoint(steps, 85),
-        EpisodeCheckpoint(episodes, 9),
+        Checkpoint(85, **steps),
+        Checkpoint(every_n_episodes=9, **episodes),
         ProgressBarCallback(),
         CallbackList([Watcher(), StopTrainingOnMaxEpisodes(60)]),
     ]

@@ -14,7 +14,7 @@ import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick import agents
 from rl_yardstick.agents import ALGORITHMS, fitting_algorithms, load_algorithm
 from rl_yardstick.agents.bandits.runs import run_batch
-from rl_yardstick.pipeline.arguments import constructor_parameters
+from rl_yardstick.pipeline.components import constructor_parameters
 from tests.agents.hand_fed import Told
 
 DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))

@@ -134,9 +134,10 @@ def test_how_a_run_ends(case):
 def test_what_was_done():
     others = OtherReturns("epsilon 0.1", 2.5, 0.9, 1.5, 1.75)
     final = replace(sampled(1.0, 3.0, yardstick=POLE), others=others)
-    usual = {"n_timesteps": 1000, "taken": WorkTime(), "engine": "compiled", "final": final}
-    usual |= {"best": 20.0, "best_timesteps": 9, "best_episodes": 1, "evaluation_steps": 700}
-    outcome = SimpleNamespace(**usual, evaluating=WorkTime(3.0, 0.5))
+    best = {"best": 20.0, "best_timesteps": 9, "best_episodes": 1, "taken": WorkTime(3.0, 0.5)}
+    parts = {"agent": {"num_timesteps": 1000}, "progress": {"taken": WorkTime()}}
+    made = {name: SimpleNamespace(**part) for name, part in {**parts, "evaluation": best}.items()}
+    outcome = SimpleNamespace(**made, engine="compiled", final=final, evaluation_steps=700)
     assert rows_of(Run(Path("logs/qlearning/Lake-v1_3")), outcome) == [
         ("trained", "1,000 steps in 0.0 s of processor time (1,000,000,000,000 steps/s)"),
         ("engine", "compiled"),

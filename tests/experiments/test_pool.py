@@ -13,8 +13,8 @@ from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.pool import ERROR_FILE, Workers, do_aside, do_run, do_runs
 from rl_yardstick.experiments.results import read_results
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import Stopped, UserError
-from rl_yardstick.pipeline.modules import import_modules
 from rl_yardstick.pipeline.run import FAILED, FINISHED, INTERRUPTED, Run, Stop, versions
 
 # An environment of a user's own, whose episodes do what their seed says.

@@ -9,10 +9,17 @@ from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from torch import nn, optim
 
-from rl_yardstick.pipeline.components import build, build_value, find_class
+from rl_yardstick.pipeline.components import (
+    build,
+    build_value,
+    check_typed,
+    find_class,
+    import_modules,
+    module_name,
+    split_id,
+)
 from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.modules import check_typed, import_modules, module_name, split_id
 from rl_yardstick.pipeline.spec import Component
 from rl_yardstick.pipeline.training import make_agent
 from tests.pipeline.short_runs import CART, spec_of

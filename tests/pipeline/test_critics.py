@@ -27,7 +27,7 @@ from rl_yardstick.pipeline.evaluation.critics import (
 )
 from rl_yardstick.pipeline.evaluation.policies import policy_matrix
 from rl_yardstick.pipeline.run import Run
-from rl_yardstick.pipeline.training import Parts
+from rl_yardstick.pipeline.training import Training, make_agent
 from tests.envs.corridors import Corridor
 from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of
 from tests.pipeline.test_resuming import content, cut_off, resumed
@@ -308,12 +308,13 @@ def test_the_agent_is_the_same_to_the_last_bit_and_figures_those_of_a_run_that_w
 def test_where_it_cannot_be_done_a_line_says_so(tmp_path):
     spec = spec_of("ppo", CART, n_timesteps=50, diagnose=True)
     file = io.StringIO()
-    parts = Parts(spec, Run(tmp_path, Console(file=file, width=1000)), False)
+    run, agent = Run(tmp_path, Console(file=file, width=1000)), make_agent(spec, tmp_path)
+    parts = Training(spec, run, agent, False)
     lines = file.getvalue().splitlines()
     (line,) = [line for line in lines if line.startswith("no diagnosis")]
     assert line.startswith("no diagnosis: the exact model of CartPole-v1 is not known")
     assert parts.evaluation.critics is None
-    parts.close()
+    agent.env.close()
 
 
 def test_each_evaluation_is_compared(tmp_path):

@@ -142,7 +142,9 @@ def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tm
     # An update follows every fourth step, and training ends with one.
     assert (before.pos, after.pos) == (200, 252)
     np.testing.assert_array_equal(after.observations[:200], before.observations[:200])
-    with pytest.raises(UserError, match=r"filled by 1 environments at once.* n_envs:1"):
+    with pytest.raises(
+        UserError, match=r"ReplayBuffer of n_envs:1 .* need a ReplayBuffer of n_envs:2"
+    ):
         train_to(tmp_path / "no", "dqn", {**SMALL_DQN, "n_envs": 2}, 50, **fields)
     assert not (tmp_path / "no").exists()
     # Playing needs none.

@@ -238,7 +238,7 @@ def test_what_is_asked_for_is_done_and_a_run_says_what_its_evaluations_took(tmp_
     during = (evaluations["ep_lengths"].mean(axis=1) * counts).sum()
     assert outcome.evaluation_steps == during + final["mean_length"] * final["n_episodes"]
     assert info["best_episodes"] in counts
-    assert outcome.evaluating.cpu_seconds > 0
+    assert outcome.evaluation.taken.cpu_seconds > 0
 
 
 # --- measured by a bracket -----------------------------------------------------------------------

@@ -40,7 +40,7 @@ def test_when_evaluations_come(algo, entry, fields, steps):
     assert (steps is None) == (outcome.final is None) == (not path.exists())
     if steps is not None:
         assert np.load(path)["timesteps"].tolist() == steps
-        assert outcome.best_timesteps in steps
+        assert outcome.evaluation.best_timesteps in steps
 
 
 def test_an_outcome_tells_what_the_run_folder_has():
@@ -52,8 +52,8 @@ def test_an_outcome_tells_what_the_run_folder_has():
     assert figures["final"]["gap"] == pytest.approx(
         figures["final"]["optimum"] - figures["final"]["mean_return"]
     )
-    assert (outcome.n_timesteps, outcome.engine, outcome.pulls) == (2000, "compiled", None)
-    assert outcome.taken.cpu_seconds > 0
+    assert (outcome.agent.num_timesteps, outcome.engine, outcome.pulled) == (2000, "compiled", None)
+    assert outcome.progress.taken.cpu_seconds > 0
     assert record["versions"]["python"].startswith("3.")
 
 
@@ -61,7 +61,7 @@ def test_a_budget_of_episodes_ends_after_so_many():
     run, outcome = trained("sarsa", LAKE, {"n_episodes": 25}, eval_freq=-1)
     rows = (run.path / "0.monitor.csv").read_text().splitlines()
     assert len(rows) == 2 + 25
-    assert outcome.n_timesteps == sum(int(row.split(",")[1]) for row in rows[2:])
+    assert outcome.agent.num_timesteps == sum(int(row.split(",")[1]) for row in rows[2:])
     with pytest.raises(UserError, match="the schedules of ppo run by steps"):
         trained("ppo", CART, {**SMALL_PPO, "n_episodes": 3, "learning_rate": "lin_0.001"})
 
@@ -69,9 +69,9 @@ def test_a_budget_of_episodes_ends_after_so_many():
 def test_a_bandits_pulls_are_summed_up():
     run, outcome = trained("ucb", "BernoulliBandit-v0", n_timesteps=300)
     pulls = np.load(run.path / "pulls.npz")
-    assert outcome.pulls.n_pulls == 300 == pulls["regrets"].size
-    assert outcome.pulls.regret == pytest.approx(float(pulls["regrets"].sum()))
-    assert run.recorded()["regret"] == outcome.pulls.regret
+    assert outcome.pulled.n_pulls == 300 == pulls["regrets"].size
+    assert outcome.pulled.regret == pytest.approx(float(pulls["regrets"].sum()))
+    assert run.recorded()["regret"] == outcome.pulled.regret
     assert outcome.final is None or outcome.final.mean_return is not None
 
 

@@ -13,14 +13,14 @@ from rich.console import Console
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
+from rl_yardstick.pipeline import callbacks, watching
 from rl_yardstick.pipeline import pictures as drawing
-from rl_yardstick.pipeline import progress, watching
+from rl_yardstick.pipeline.callbacks import ProgressCallback
 from rl_yardstick.pipeline.curve_pictures import read_monitors
 from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.value_maps import value_map
-from rl_yardstick.pipeline.progress import ProgressCallback
 from rl_yardstick.pipeline.watching import TERMINATED, TableRecorder
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, run_of, spec_of, trained
 
@@ -134,12 +134,12 @@ def text_shown(n_steps, *, live):
 
 
 def test_elsewhere_plain_lines_now_and_then_and_in_a_terminal_a_bar(monkeypatch):
-    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr(callbacks, "SECONDS_BETWEEN_LINES", 0.0)
     lines = text_shown(1000, live=False).splitlines()
     form = r" *(\d+)%  ([\d,]+) steps(  mean return in training 0\.\d\d)?"
     assert all(re.fullmatch(form, line) for line in lines)
     assert lines[-1].startswith("100%  1,000 steps")
-    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 1e9)
+    monkeypatch.setattr(callbacks, "SECONDS_BETWEEN_LINES", 1e9)
     assert text_shown(1000, live=False) == ""
     assert "\x1b[" in text_shown(1000, live=True)
 

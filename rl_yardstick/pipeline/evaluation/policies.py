@@ -29,7 +29,7 @@ from rl_yardstick.agents.reference import RandomAgent
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.finite_numbers import check_rows
+from rl_yardstick.pipeline.finite_numbers import check_numbers
 
 
 def is_of_library(module: str) -> bool:
@@ -82,7 +82,7 @@ class Player:
 
     def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
         """Check the observation, then predict."""
-        check_rows(observation, "observation", self.when)
+        check_numbers(observation, "observation", self.when, in_rows=True)
         if self.is_masked:
             kwargs["action_masks"] = present_masks(self.env, observation)
         actions, state = self.model.predict(observation, **kwargs)

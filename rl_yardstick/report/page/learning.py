@@ -19,12 +19,12 @@ from rl_yardstick.experiments.analysis import StudyAnalysis
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.pool import process_pool
 from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.evaluation.value_maps import MAX_STATES, ValueMapRecorder
 from rl_yardstick.pipeline.files import read_bytes, read_json, write_json, write_text
 from rl_yardstick.pipeline.models import MAX_MODEL
-from rl_yardstick.pipeline.modules import import_modules
 from rl_yardstick.pipeline.run import RECORD, Run, Stop
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.pipeline.watching import TableRecorder, Watch
