@@ -202,7 +202,7 @@ class Dimension:
 
 
 def ends(distribution: BaseDistribution) -> list[Any]:
-    """All words of a choice, or the ends of a range; of a range of floats, also one between them."""
+    """All words of a choice, or the ends of a range; of floats, also one between them."""
     if isinstance(distribution, CategoricalDistribution):
         return list(distribution.choices)
     assert isinstance(distribution, FloatDistribution | IntDistribution)

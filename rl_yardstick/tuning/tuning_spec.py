@@ -37,7 +37,7 @@ class TuningSpec:
     figure: str = AUTO  #: one of `FIGURES`; or `AUTO`, until the kind of runs is known
     objective: str = "mean"  #: the value of a setting over its seeds, see `value`
     sampler: str = "tpe"  #: the sampler of settings
-    pruner: str = "auto"  #: whether hopeless trials end early, see `pruning`; or "none"
+    pruner: str = "auto"  #: "auto": trials end early by `searching.is_hopeless`; or "none"
     n_startup_trials: int = 10  #: random trials before the sampler learns
     seed: int = 0  #: seed of the sampler, and of the order of seeds
     search_space: Path | None = None  #: a file with the space; None for the agent's own

@@ -21,7 +21,6 @@ from rl_yardstick.experiments.results import (
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.settings import read_entry, seeds_tuned_on
 from rl_yardstick.tuning import retesting, searching
-from rl_yardstick.tuning.pruning import is_hopeless
 from rl_yardstick.tuning.retesting import (
     Outcome,
     Retested,
@@ -39,6 +38,7 @@ from rl_yardstick.tuning.searching import (
     RUNS,
     SETTINGS,
     RunOutcome,
+    is_hopeless,
     open_storage,
     outcome_of,
     outcomes_of,
