@@ -275,8 +275,7 @@ def retested(
 ) -> tuple[int, Outcome]:
     """Do the re-test; return the exit code and the outcome."""
     from rl_yardstick.experiments.analysis import analyse
-    from rl_yardstick.experiments.growing import plan_of_looks
-    from rl_yardstick.experiments.plan import StudyRecord, plan, specs_of
+    from rl_yardstick.experiments.plan import StudyRecord, plan, plan_of_looks, specs_of
     from rl_yardstick.tuning.retesting import FOLDER, concluded, is_settled, retest_study
 
     tuning, again = search.tuning, replace(job, root=job.root / FOLDER)

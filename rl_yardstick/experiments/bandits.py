@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,8 +47,6 @@ class PullStatistics:
     total_reward: Annotated[Floats, "runs"]
     total_regret: Annotated[Floats, "runs"]
     shares: Annotated[Floats, "contexts arms"]  # share of each arm among the pulls, by context
-    # Mean regret of a pull; nan if the arm was never pulled.
-    context_regret: Annotated[Floats, "contexts arms"]
     # Mean of the final estimates over runs; empty if the agent has no estimates. An agent without
     # contexts has one row for all.
     estimates: Annotated[Floats, "seen arms_seen"]
@@ -110,12 +107,9 @@ def pull_statistics(
     cells = arms.astype(np.int64) + n_arms * (0 if contexts is None else contexts.astype(np.int64))
     size = n_arms * n_contexts
     counts = np.bincount(cells.ravel(), minlength=size).reshape(n_contexts, n_arms)
-    sums = np.bincount(cells.ravel(), weights=regrets.ravel(), minlength=size)
-    empty = np.empty((0, 0))
     with np.errstate(invalid="ignore"):
-        context_regret = sums.reshape(n_contexts, n_arms) / counts
         shares = counts / counts.sum(axis=1, keepdims=True)
-    n_runs = len(arms)
+    n_runs, empty = len(arms), np.empty((0, 0))
     mean, std = _mean_and_std(empty[None] if estimates is None else estimates)
     return PullStatistics(
         pulls=points,
@@ -129,7 +123,6 @@ def pull_statistics(
         total_reward=rewards.sum(axis=1, dtype=np.float64),
         total_regret=cumulative[:, -1],
         shares=shares,
-        context_regret=context_regret,
         estimates=mean,
         estimates_std=std,
         true_means=empty if true_means is None else true_means,
@@ -230,25 +223,15 @@ def _statistics_on(
     with closing(make_single_env(spec)) as env:
         bandit: Any = env.unwrapped
         n_arms, n_contexts = bandit.n_arms, max(bandit.n_contexts, 1)
-        is_known = bandit.n_contexts > 0 and not _is_drifting(bandit)
-        more["true_means"] = true_means(env)
+        drifts, means = getattr(bandit, "drift_std", 0.0) > 0, getattr(bandit, "means", None)
+        if means is not None and not drifts and not getattr(bandit, "redraws", False):
+            more["true_means"] = np.array(means, dtype=np.float64)
+        is_known = bandit.n_contexts > 0 and not drifts
     contexts = contexts if n_contexts > 1 else None
     found = pull_statistics(arms, rewards, regrets, contexts, n_arms, n_contexts, **more)
     # Simple regret is not defined if the means drift, or depend on a vector.
     nowhere = np.full_like(found.simple_regret, np.nan)
     return found if is_known else replace(found, simple_regret=nowhere)
-
-
-def true_means(env: gym.Env[Any, Any]) -> Floats | None:
-    """Means of the arms by context, shape (n_contexts, n_arms), if all runs have the same."""
-    bandit: Any = env.unwrapped
-    moves = getattr(bandit, "redraws", False) or _is_drifting(bandit)
-    means = getattr(bandit, "means", None)
-    return None if moves or means is None else np.array(means, dtype=np.float64)
-
-
-def _is_drifting(bandit: Any) -> bool:
-    return bool(getattr(bandit, "drift_std", 0.0) > 0)
 
 
 # --- all runs of an agent as one batch: each a fresh agent and one episode ------------------------
@@ -262,18 +245,13 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run) -> None:
     started = WorkTime.now()
     with compile_timer() as time_compiling:
         result, engine = _run(spec, n_runs)
-    _check_rewards(result, spec.seed)
-    statistics = _statistics_on(
-        spec,
-        result.arms,
-        result.rewards,
-        result.regrets,
-        result.contexts,
-        estimates=result.estimates,
-        moments=result.moments,
-        posteriors=result.posteriors,
-    )
-    statistics.save(run.path / STATISTICS_FILE)
+    for seed, rewards in enumerate(result.rewards, start=spec.seed):
+        if not np.isfinite(rewards).all():
+            pull = int(np.argmin(np.isfinite(rewards)))
+            raise UserError(f"reward of seed {seed} at step {pull + 1:,} is {rewards[pull]}")
+    pulls = result.arms, result.rewards, result.regrets, result.contexts
+    more = {name: getattr(result, name) for name in ("estimates", "moments", "posteriors")}
+    _statistics_on(spec, *pulls, **more).save(run.path / STATISTICS_FILE)
     taken = WorkTime.now() - started - time_compiling()
     figures = {"n_runs": n_runs, "n_timesteps": len(result.arms[0]), "engine": engine}
     run.record(spec, FINISHED, **figures, **taken.as_data())
@@ -298,11 +276,3 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
         return run_batch(*arguments), "compiled batch"
     except NotCompilable as reason:
         return run_one_by_one(*arguments), f"one by one: {reason}"
-
-
-def _check_rewards(result: BatchResult, first_seed: int) -> None:
-    """Refuse rewards that are not finite."""
-    for seed, rewards in enumerate(result.rewards, start=first_seed):
-        if not np.isfinite(rewards).all():
-            pull = int(np.argmin(np.isfinite(rewards)))
-            raise UserError(f"reward of seed {seed} at step {pull + 1:,} is {rewards[pull]}")

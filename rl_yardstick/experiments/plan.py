@@ -52,7 +52,6 @@ MAY_DIFFER = (
     *("origins", "map_name", "tensorboard_log", "gym_packages", "save_every_n_episodes"),
     *("pictures", "log_interval", "library_log"),
 )
-MOST_RUNS = 1_000_000
 FINAL_EPISODES = 100  # of the sampled evaluation at the end of a run
 
 Labels = tuple[str, str]  # of agent and environment
@@ -169,12 +168,6 @@ def specs_of(study: StudySpec) -> dict[Labels, TrainSpec]:
     Raises:
         UserError: if an agent's settings are invalid, or it does not fit an environment.
     """
-    n_agents, n_environments = len(study.agents), len(study.environments)
-    if (n_runs := n_agents * n_environments * study.n_seeds) > MOST_RUNS:
-        raise UserError(
-            f"{study.name}: {n_agents:,} agents on {n_environments:,} environments with "
-            f"{study.n_seeds:,} seeds are {n_runs:,} runs; a study has {MOST_RUNS:,} at most"
-        )
     _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
     _check_folders("environments", [(one.label, one.folder) for one in study.environments])
     specs = {}
@@ -208,22 +201,19 @@ def _is_batch(spec: TrainSpec) -> bool:
     entry = ALGORITHMS[spec.algo]
     if not (entry.for_bandits and entry.package is None) or spec.n_timesteps is None:
         return False
-    if entry.family != "bandits" and not _is_compiled_bandit(spec.algo):
-        return False
+    if entry.family != "bandits":
+        from rl_yardstick.agents import load_algorithm
+        from rl_yardstick.agents.bandits.linear import LinearBanditAgent
+        from rl_yardstick.agents.bandits.tables import TableBandit
+
+        # A user's agent may be a subclass.
+        if not issubclass(load_algorithm(spec.algo), TableBandit | LinearBanditAgent):
+            return False
     with closing(make_single_env(spec)) as env:
         if spec.n_timesteps > (time_limit(env) or 0):
             return False
     # What a batch supports besides the agent's own arguments.
     return not spec.hyperparams.keys() - {"n_timesteps", "env_kwargs", *spec.algorithm}
-
-
-def _is_compiled_bandit(algo: str) -> bool:
-    """Whether a user's agent is a subclass of this project's compiled bandit agents."""
-    from rl_yardstick.agents import load_algorithm
-    from rl_yardstick.agents.bandits.linear import LinearBanditAgent
-    from rl_yardstick.agents.bandits.tables import TableBandit
-
-    return issubclass(load_algorithm(algo), TableBandit | LinearBanditAgent)
 
 
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
@@ -250,13 +240,12 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
 # In half of the steps, some networks would train in the library's loop, and take longer.
 QUICK_TABLE_STEPS, QUICK_STEPS = 200_000, 20_000
 STEPS_OF_EPISODE = 100
-# The library's agents that can train in compiled code.
-NETWORKS = frozenset({"dqn", "double_dqn", "deep_qlearning", "ppo", "a2c"})
 
 
 def _quickened(spec: TrainSpec, quick: QuickSpec) -> dict[str, int]:
     """A small budget, in the unit of the spec's own."""
-    is_table = spec.algo not in NETWORKS and "compiled" in ALGORITHMS[spec.algo].engines
+    entry = ALGORITHMS[spec.algo]
+    is_table = entry.family != "library" and "compiled" in entry.engines
     steps = QUICK_TABLE_STEPS if is_table else QUICK_STEPS
     found = {}
     for key, most in (("n_timesteps", steps), ("n_episodes", steps // STEPS_OF_EPISODE)):
@@ -304,7 +293,10 @@ class StudyRecord:
             {"agent": agent, "environment": environment, "spec": spec.model_dump()}
             for (agent, environment), spec in self.specs.items()
         ]
-        study = asdict(self.study, dict_factory=_with_paths_as_texts)
+        study = asdict(
+            self.study,
+            dict_factory=lambda items: {k: str(v) if isinstance(v, Path) else v for k, v in items},
+        )
         write_json(root / RECORD, {"study": study, "looks": self.looks, "specs": specs})
 
     @classmethod
@@ -333,8 +325,55 @@ class StudyRecord:
             raise UserError(f"{root / RECORD} is no study of this version") from error
 
 
-def _with_paths_as_texts(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    return {key: str(value) if isinstance(value, Path) else value for key, value in pairs}
+# --- studies that get more seeds until all pairs are decided --------------------------------------
+
+MOST_SEEDS = 80
+
+
+def plan_of_looks(study: StudySpec, root: Path, most: int | None) -> tuple[int, ...]:
+    """The seeds at each look of a study, fixed before the first look and kept in ``study.json``.
+
+    Args:
+        study: the study.
+        root: its folder.
+        most: the largest number of seeds of an agent; None: as planned before, or ``MOST_SEEDS``.
+
+    Raises:
+        UserError: if this differs from an earlier plan, or there is nothing to decide.
+    """
+    if len(study.agents) < 2:
+        raise UserError(f"{study.name}: --until-decided takes two agents or more")
+    if most is not None and most < study.n_seeds:
+        raise UserError(f"--max-seeds is {most}, the study begins with {study.n_seeds} seeds")
+    before = StudyRecord.read(root) if (root / RECORD).exists() else None
+    if before is None or not before.looks:
+        return look_sizes(study.n_seeds, max(most or MOST_SEEDS, study.n_seeds))
+    looks = look_sizes(study.n_seeds, most or before.looks[-1])
+    there, here = _fixed(before.study, before.looks), _fixed(study, looks)
+    if changed := [f"{k} {there[k]}, now {here[k]}" for k in there if there[k] != here[k]]:
+        raise UserError(
+            f"{root}: the looks were planned before the first of them and cannot change "
+            f"({'; '.join(changed)}): --name NAME makes another study"
+        )
+    return looks
+
+
+def _fixed(study: StudySpec, looks: tuple[int, ...]) -> dict[str, object]:
+    """What must not change from one look to the next."""
+    return {
+        "looks": [*looks],
+        "agents": sorted(agent.label for agent in study.agents),
+        "environments": sorted(environment.label for environment in study.environments),
+        **{name: getattr(study, name) for name in ("metric", "margin", "first_seed", "against")},
+    }
+
+
+def look_sizes(first: int, most: int) -> tuple[int, ...]:
+    """The number of seeds of an agent at each look: twice as many as before, up to ``most``."""
+    sizes = [first]
+    while sizes[-1] < most:
+        sizes.append(min(2 * sizes[-1], most))
+    return tuple(sizes)
 
 
 def other_settings(planned: Sequence[PlannedRun]) -> list[tuple[PlannedRun, dict[str, Any]]]:

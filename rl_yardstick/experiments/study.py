@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -34,7 +33,6 @@ COSTS = ("regret",)  # metrics of which less is better
 OF_TRAINING = ("training", "last_episodes")  # mean returns of training episodes
 # Settings of a training variant of the environment, with the values that switch it off.
 AS_IT_COMES: dict[str, Any] = {"train_env_kwargs": None, "train_env_wrapper": None}
-MOST_AGENTS = 10_000
 MOST_PAIRS = 10  # of agent and environment, for two seeds of each in a quick look
 _SHIPPED = Path(__file__).resolve().parents[1] / "studies"
 
@@ -461,14 +459,7 @@ def _agents(document: _Lines, file: _File) -> list[AgentSpec]:
             summary=entry.summary,
             where=document.at(*keys),
         )
-        sweep = {**file.sweep, **entry.sweep}
-        n_agents = len(agents) + math.prod(map(len, sweep.values()))
-        if n_agents > MOST_AGENTS:
-            raise UserError(
-                f"{agent.where}: {n_agents:,} agents up to here; a study has {MOST_AGENTS:,} at "
-                "most"
-            )
-        agents += swept(agent, sweep)
+        agents += swept(agent, {**file.sweep, **entry.sweep})
     if len({agent.group for agent in agents}) == 1 and agents[0].swept:
         agents = [replace(a, label=a.label.removeprefix(f"{a.group} with ")) for a in agents]
     return agents

@@ -96,7 +96,7 @@ class TuningSpec:
 
     def check(self) -> None:
         """Check that search and re-test share no seeds, and that a re-test can grow."""
-        from rl_yardstick.experiments.growing import MOST_SEEDS
+        from rl_yardstick.experiments.plan import MOST_SEEDS
 
         most = least = self.retest_seeds
         if self.until_decided:

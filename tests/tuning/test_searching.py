@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 from optuna.trial import create_trial
 
-from rl_yardstick.experiments.analysis import analyse
-from rl_yardstick.experiments.growing import looked
+from rl_yardstick.experiments.analysis import analyse, looked
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.results import (
     CURVE_COLUMNS,
