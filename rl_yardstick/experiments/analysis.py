@@ -80,11 +80,9 @@ class Evidence:
         return {name: np.clip((x - zero) / (one - zero), 0, 1) for name, x in given.items()}
 
     @property
-    def score_bounds(self) -> Bounds:
-        """The least and the greatest possible of these scores."""
-        if self.is_score:
-            return UNIT
-        return (-self.bounds[1], -self.bounds[0]) if self.is_cost else self.bounds
+    def judged_bounds(self) -> Bounds:
+        """The least and the greatest possible score, or else metric."""
+        return UNIT if self.is_score else self.bounds
 
 
 def evidence_of(results: StudyResults) -> list[Evidence]:
@@ -98,14 +96,11 @@ def _evidence_on(results: StudyResults, environment: str) -> Evidence:
     study, table = results.study, results.summary
     table = table[table["environment"] == environment]
     optimum, baseline = _first(table, "optimum"), _first(table, "baseline")
-    at_least = _first(table, "optimum_at_least")
-    is_score, span = False, 0.0
+    is_score, margin = False, study.margin or 0.0
     if study.metric in ON_THE_SCALE and optimum is not None and baseline is not None:
         is_score = Yardstick(optimum, baseline).has_scale
-        span = optimum - baseline
-    margin = study.margin or 0.0
-    if is_score:
-        margin = MARGIN if study.margin is None else study.margin / span
+        if is_score:
+            margin = MARGIN if study.margin is None else study.margin / (optimum - baseline)
     # Agents that do not learn are certain if policies are evaluated exactly.
     is_exact = (table["exact"] == True).all()  # noqa: E712  # None is neither True nor False
     fixed = [a.label for a in study.agents if ALGORITHMS[a.algo].family in FIXED_POLICIES]
@@ -118,7 +113,7 @@ def _evidence_on(results: StudyResults, environment: str) -> Evidence:
         values=values_over_seeds(results, environment, study.metric),
         seeds=seeds,
         optimum=optimum,
-        optimum_at_least=at_least,
+        optimum_at_least=_first(table, "optimum_at_least"),
         baseline=baseline,
         threshold=_first(table, "threshold"),
         bounds=_bounds(results, environment, optimum),
@@ -147,22 +142,18 @@ def _first(table: pd.DataFrame, column: str) -> float | None:
     return None if known.empty else float(known.iloc[0])
 
 
-def verdicts_on(
+def _verdicts_on(
     study: StudySpec,
     evidence: Sequence[Evidence],
-    looks: Sequence[int] = (),
+    looks: Sequence[int],
     overall: Mapping[str, Floats] | None = None,
 ) -> Study:
-    """The verdicts on all pairs of a study.
-
-    Args:
-        study: the study.
-        evidence: of each environment with runs.
-        looks: the seeds at each look of a study that grows until it is decided.
-        overall: by agent, its mean score over all environments for each seed, shape (n_seeds,).
-    """
+    """The verdicts on all pairs; ``overall`` has mean scores over all environments by seed."""
     scores: dict[str, Mapping[str, Floats]] = {one.environment: one.scores for one in evidence}
-    bounds = {one.environment: one.score_bounds for one in evidence}
+    bounds = {one.environment: one.judged_bounds for one in evidence}
+    for one in evidence:
+        if one.is_cost:
+            bounds[one.environment] = (-one.bounds[1], -one.bounds[0])
     margin = {one.environment: one.margin for one in evidence}
     baseline = {one.environment: 0.0 if one.is_score else None for one in evidence}
     if overall is not None:
@@ -183,10 +174,9 @@ def verdicts_on(
 def looked(results: StudyResults, looks: Sequence[int]) -> Study:
     """The verdicts of a growing study after all looks that its runs allow.
 
-    All looks are computed from the scores: the result does not depend on how often somebody ran the
-    command.
+    All looks are computed from the scores, however often somebody ran the command.
     """
-    return verdicts_on(results.study, evidence_of(results), looks)
+    return _verdicts_on(results.study, evidence_of(results), looks)
 
 
 # --- all environments together --------------------------------------------------------------------
@@ -202,7 +192,7 @@ class OverallAnalysis:
     pairs: tuple[Pair, ...]
     best: Best | None  #: likewise None
     thresholds: Floats  #: the scores of the profiles, shape (n,)
-    profiles: Mapping[str, Floats]  #: by agent, the share of runs above each of these scores
+    profiles: Mapping[str, Floats]  #: by agent, the share of runs above each of these
 
 
 def scores_over_all(results: StudyResults) -> dict[str, Floats] | None:
@@ -255,21 +245,19 @@ class AgentAnalysis:
     n_runs: int  #: finished runs
     n_missing: int  #: unfinished runs
     metric: Summary  #: the metric of the verdicts, over seeds
-    #: The final policy's score: 0 is the best random or constant policy, 1 the optimum; less
-    #: counts as 0. None if these are not known.
+    #: The final policy's score, cut at 0 and 1; None if its scale is not known.
     score: Estimate | None
     final: Estimate  #: mean return of the final policy
     last_episodes: Estimate  #: mean return of the last training episodes
     regret: Estimate  #: on bandits, the sum over all pulls; else NaN
-    #: Steps until the learning curve first reached the threshold; None without a threshold.
+    #: Steps until the learning curve first reached the threshold, steps and episodes until it
+    #: reached the threshold for good; None without a threshold.
     steps_to_threshold: ThresholdSummary | None
-    episodes_to_stay: ThresholdSummary | None  #: episodes until it reached the threshold for good
+    steps_to_stay: ThresholdSummary | None
+    episodes_to_stay: ThresholdSummary | None
     success_rate: Estimate | None  #: of the final policy; None if not reported
     seconds: Estimate  #: processor time of training
-    #: Training's changes of the environment in words, as the runs recorded them.
-    changes: tuple[str, ...] = ()
-    #: Steps until the learning curve reached the threshold for good; None without a threshold.
-    steps_to_stay: ThresholdSummary | None = None
+    changes: tuple[str, ...] = ()  #: of the environment in training, in words
     #: Exact return of the policy that acts in training, None if unknown, and its description.
     stochastic: Estimate | None = None
     acts_by: str = ""
@@ -330,19 +318,13 @@ class StudyAnalysis:
 
 
 def analyse(results: StudyResults, looks: Sequence[int] = ()) -> StudyAnalysis:
-    """Analyse the runs of a study.
-
-    Args:
-        results: the runs.
-        looks: the seeds at each look, if the study grows until its pairs are decided.
-    """
+    """Analyse the runs of a study; ``looks`` are the seeds at each look, if it grows."""
     evidence = evidence_of(results)
     scores = scores_over_all(results)
     means = {name: matrix.mean(axis=1) for name, matrix in scores.items()} if scores else None
-    said = verdicts_on(results.study, evidence, looks, None if looks else means)
-    environments = [_analyse_environment(results, one, said, looks) for one in evidence]
-    overall = _overall(scores, said) if scores else None
-    return StudyAnalysis(results, said, tuple(environments), overall)
+    said = _verdicts_on(results.study, evidence, looks, None if looks else means)
+    environments = tuple(_analyse_environment(results, one, said, looks) for one in evidence)
+    return StudyAnalysis(results, said, environments, _overall(scores, said) if scores else None)
 
 
 def _analyse_environment(
@@ -418,11 +400,8 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
 
     compared = evidence.scores[agent]
     finite = compared[np.isfinite(compared)]
-    sign = -1.0 if evidence.is_cost else 1.0
-    low, high = evidence.score_bounds if evidence.is_score else evidence.bounds
-    judged = mean_over_runs(compared if evidence.is_score else sign * compared, (low, high))
-    optimum, baseline = evidence.optimum, evidence.baseline
-    score = None
+    judged = mean_over_runs(-compared if evidence.is_cost else compared, evidence.judged_bounds)
+    optimum, baseline, score = evidence.optimum, evidence.baseline, None
     if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
         score = mean_over_runs(np.clip(values("score"), 0, 1), UNIT)
     of_returns = evidence.bounds if study.metric in ON_THE_SCALE else UNBOUNDED

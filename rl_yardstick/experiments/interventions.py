@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
-from itertools import count
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from rl_yardstick.pipeline.spec import TrainSpec
 
 SEEDS = 4
 SHIPPED, AS_IT_IS = "as shipped", "as it is"
-_RANKS = {SHIPPED: 0, AS_IT_IS: 1}
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +41,9 @@ class Tried:
 
 
 def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> StudySpec:
-    """Make a study of a run's agent, as shipped, unchanged and with each of the changes.
+    """Make a study of the agent of the run ``name``, as shipped, unchanged and with each change.
 
-    Args:
-        spec: the spec of the run.
-        changes: each as ``key:value``, or several of these separated by spaces.
-        name: the name of the run.
+    Changes are typed as ``key:value``, or several of these separated by spaces.
 
     Raises:
         UserError: if a change cannot be parsed.
@@ -61,13 +56,13 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
     unchanged = {SHIPPED: shipped, AS_IT_IS: own}
     if {**own, "engine": None} == {**shipped, "engine": None}:
         unchanged = {f"{SHIPPED}, {AS_IT_IS}": own}
-    labels: dict[str, str] = {}  # by folder, where some systems ignore case
-    agents = []
-    for change, values in {**first, **unchanged, **settings}.items():
-        names = (change if n == 1 else f"{change} ({n})" for n in count(1))
-        label = next(name for name in names if file_name(name).casefold() not in labels)
-        labels[file_name(label).casefold()] = label
-        agents.append(AgentSpec(label, spec.algo, _fast(spec.algo, values), tuned=False))
+    # Compiled code if possible, unless the settings name an engine.
+    has_auto = "=auto" in arguments_of(spec.algo).get("engine", ())
+    fast: dict[str, Any] = {"engine": "auto"} if has_auto else {}
+    agents = [
+        AgentSpec(change, spec.algo, {**fast, **values}, tuned=False)
+        for change, values in {**first, **unchanged, **settings}.items()
+    ]
     # Two models of one name share a folder only if their settings are the same.
     digest = sha256(repr(sorted(plain(own).items())).encode()).hexdigest()[:8]
     environment = f"{spec.env_id} ({spec.map_name})" if spec.map_name else spec.env_id
@@ -79,12 +74,6 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
         n_seeds=SEEDS,
         gym_packages=tuple(spec.gym_packages),
     )
-
-
-def _fast(algo: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings with compiled code if possible, unless they name an engine."""
-    has_auto = "=auto" in arguments_of(algo).get("engine", ())
-    return {"engine": "auto", **settings} if has_auto else settings
 
 
 def relative_length(runs: Sequence[PlannedRun], spec: TrainSpec, steps: int) -> float:
@@ -100,5 +89,6 @@ def tried(results: StudyResults) -> list[Tried]:
     for agent in results.study.agents:
         rows = results.summary[results.summary["agent"] == agent.label].set_index("seed")["final"]
         found.append(Tried(agent.label, rows.reindex(results.study.seeds).to_numpy(float)))
-    by_return = sorted(found, key=lambda one: -one.mean)
-    return sorted(by_return, key=lambda one: _RANKS.get(one.change.partition(",")[0], len(_RANKS)))
+    unchanged = (SHIPPED, f"{SHIPPED}, {AS_IT_IS}", AS_IT_IS)
+    ranks = {change: rank for rank, change in enumerate(unchanged)}
+    return sorted(found, key=lambda one: (ranks.get(one.change, len(ranks)), -one.mean))

@@ -183,11 +183,7 @@ def difference_in_value(
     everywhere. If few pulls inform a choice, all may have had equal rewards by chance, and the
     terms alone would look too certain.
 
-    Args:
-        first: the terms of one policy.
-        second: the terms of the other, on the same log.
-        n_comparisons: the number of comparisons; the intervals of all of them hold
-            simultaneously with 95 %.
+    The intervals of all ``n_comparisons`` hold simultaneously with 95 %.
     """
     confidence = 1 - 0.05 / n_comparisons
     found = mean_reward(first.doubly_robust - second.doubly_robust, confidence)
@@ -410,13 +406,9 @@ def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
         observations = data.observations(agent.observation_space)
     except ValueError as error:
         raise UserError(f"{policy.name}: {one_line(error)}") from error
-    reason = why_not_exact(agent, observations)
-    if reason:
+    if reason := why_not_exact(agent, observations):
         raise UserError(f"{policy.name} cannot be judged on a log: {reason}")
-    try:
-        return policy_matrix(agent, observations)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{policy.name} cannot be judged on a log: {one_line(error)}") from error
+    return policy_matrix(agent, observations)
 
 
 def _judge(data: LoggedData, name: str, policy: Floats, predicted: Floats) -> PolicyTerms:

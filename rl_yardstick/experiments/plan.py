@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -131,13 +131,10 @@ def plan(
     counts: Mapping[Labels, int] | None = None,
     specs: Specs | None = None,
 ) -> list[PlannedRun]:
-    """Plan all runs of a study, ordered by seed, so that agents can be compared early.
+    """Plan all runs of a study in the folder ``root``, by seed: agents can be compared early.
 
-    Args:
-        study: the study.
-        root: its folder.
-        counts: by labels of agent and environment, the number of seeds; by default all.
-        specs: by these labels, what is trained; by default from the study, see `specs_of`.
+    ``counts`` has the number of seeds by labels of agent and environment, by default all; ``specs``
+    what is trained, by default `specs_of` the study.
     """
     specs = specs or specs_of(study)
     folders = {environment.label: environment.folder for environment in study.environments}
@@ -333,10 +330,7 @@ MOST_SEEDS = 80
 def plan_of_looks(study: StudySpec, root: Path, most: int | None) -> tuple[int, ...]:
     """The seeds at each look of a study, fixed before the first look and kept in ``study.json``.
 
-    Args:
-        study: the study.
-        root: its folder.
-        most: the largest number of seeds of an agent; None: as planned before, or ``MOST_SEEDS``.
+    ``most`` is the largest number of seeds of an agent; None: as planned before, or ``MOST_SEEDS``.
 
     Raises:
         UserError: if this differs from an earlier plan, or there is nothing to decide.
@@ -413,7 +407,13 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
     files: dict[str, Seeds] = {}
     unknown: dict[str, None] = {}
     elsewhere: dict[str, None] = {}
-    known = lru_cache(maxsize=None)(_said)
+
+    @cache
+    def known(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] | None:
+        with suppress(UserError):  # the file existed when the runs were planned
+            return seeds_tuned_on(algo, env_id, conf_file)
+        return None
+
     for agent, environment in product(study.agents, study.environments):
         label = agent.group or agent.label
         tuned_on = known(agent.algo, environment.env_id, agent.conf_file)
@@ -450,10 +450,3 @@ def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:
 
     keys = [key for key in (*ENV_KWARGS, "train_env_wrapper") if key in own]
     return any(meant(merged, key) != meant(entry, key) for key in keys)
-
-
-def _said(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] | None:
-    try:
-        return seeds_tuned_on(algo, env_id, conf_file)
-    except UserError:  # the file existed when the runs were planned
-        return None

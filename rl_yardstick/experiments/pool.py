@@ -35,10 +35,7 @@ _WINDOWS_OR_MAC = sys.platform in ("win32", "darwin")  # where forked libraries 
 def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> None:
     """Do one run in this process, or what is left of it. This is what any pool or cluster calls.
 
-    Args:
-        planned: the run.
-        command: the user's command, for the run folder.
-        stop: asks the run to stop; by default a SIGTERM does.
+    ``command`` is the user's, for the run folder; ``stop`` is None to stop after a SIGTERM.
 
     Raises:
         UserError: with the reason, if the run fails.
@@ -73,17 +70,16 @@ def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> 
 
 def _can_resume(planned: PlannedRun, run: Run) -> bool:
     """Whether the folder has a state of this run, saved with the same versions."""
-    if not run.state_path.exists() or planned.differences(planned.recorded()):
-        return False
     with suppress(UserError):
-        return resumable(run.path) is not None
+        is_this = run.state_path.exists() and not planned.differences(planned.recorded())
+        return is_this and resumable(run.path) is not None
     return False
 
 
 def _clear(planned: PlannedRun) -> None:
     """Remove what an earlier attempt has left."""
     for path in planned.path.iterdir():
-        if path.is_dir() and not path.is_symlink():
+        if path.is_dir():
             shutil.rmtree(path)
         elif path.name != LOCK:
             path.unlink()
@@ -112,11 +108,9 @@ def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
 class Workers:
     """Processes of this machine that do runs, one after another, until the ``with`` ends.
 
-    Args:
+    Attributes:
         n_at_once: their number.
         timeout: seconds for each run; None for any time.
-
-    Attributes:
         words: the workers in a few words.
     """
 
@@ -189,20 +183,10 @@ def available_cores() -> int:
 def do_runs(
     runs: Sequence[PlannedRun], workers: Workers, command: str, console: Console, stop: Stop
 ) -> dict[Path, str]:
-    """Do runs in their order; tell the progress, and each run that fails in a line.
-
-    Args:
-        runs: those that are to do.
-        workers: who does them.
-        command: the user's command, for the run folders.
-        console: where progress and failures are printed.
-        stop: after a signal, running ones are stopped at their next safe moment.
+    """Do runs in their order, see `keep_busy`; tell the progress, and each failure in a line.
 
     Returns:
         The reason of each failure, by the folder of the run.
-
-    Raises:
-        Stopped: after a signal.
     """
     failures: dict[Path, str] = {}
     to_do = list(runs)[::-1]
@@ -228,10 +212,10 @@ def keep_busy(
     """Do runs until there is none to begin, and none under way.
 
     Args:
-        workers: who does them.
-        next_run: the next run; None if none can begin before another ends.
+        workers: the workers.
+        next_run: returns the next run; None if none can begin before another ends.
         ended: called after each run, with the reason if it has failed.
-        command: the user's command, for the run folders.
+        command: the user's, for the run folders.
         stop: after a signal, running ones are stopped at their next safe moment.
 
     Raises:
@@ -278,7 +262,7 @@ def _in_words(error: BaseException, run: PlannedRun, timeout: float | None) -> s
 def progress(console: Console, total: int, what: str = "runs") -> Iterator[Callable[[int], None]]:
     """A bar on a terminal, and else a line now and then and at the end.
 
-    Yields what is to be called after each piece of work, with the number of those that have failed.
+    Yields a function to call after each piece of work, with the number of those that have failed.
     """
     begun = told_at = time.monotonic()
     columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()

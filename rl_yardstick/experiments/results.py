@@ -231,25 +231,20 @@ def read_results(
 ) -> StudyResults:
     """Read all finished runs, except runs with files that cannot be read.
 
-    Args:
-        study: the study.
-        planned: the runs.
-        root: the study's folder.
-        known: runs that have been read before; those that are read now are added.
+    ``known`` has the runs that have been read before; those that are read now are added.
     """
     known = {} if known is None else known
-    found, done, left_out = [], [], []
+    done, left_out = [], []
     for run in planned:
-        key = run.path, run.n_runs
         try:
-            results = known.get(key) or read_run(study, run)
+            results = known.get((run.path, run.n_runs)) or read_run(study, run)
         except (UserError, OSError) as error:
             left_out.append(LeftOut(run, one_line(error)))
             continue
         if results is not None:
-            known[key] = results
-            found.append(results)
+            known[run.path, run.n_runs] = results
             done.append(run)
+    found = [known[run.path, run.n_runs] for run in done]
     rows = [row for results in found for row in results.rows]
     is_hidden = any(row.get("full_optimum") is not None for row in rows)
     columns = [*RUN_COLUMNS, *(HIDDEN_COLUMNS if is_hidden else ())]
@@ -387,12 +382,10 @@ def speed_figures(
 
 def values_over_seeds(results: StudyResults, environment: str, column: str) -> dict[str, Floats]:
     """A column of the summary by agent, shape (n_seeds,); NaN for a missing run."""
-    table = results.summary
-    table = table[table["environment"] == environment]
+    table = results.summary[results.summary["environment"] == environment]
+    labels = [agent.label for agent in results.study.agents]
     pivot = table.pivot(index="seed", columns="agent", values=column)
-    pivot = pivot.reindex(
-        index=results.study.seeds, columns=[a.label for a in results.study.agents]
-    )
+    pivot = pivot.reindex(index=results.study.seeds, columns=labels)
     return {str(agent): pivot[agent].to_numpy(dtype=np.float64, na_value=np.nan) for agent in pivot}
 
 
@@ -400,8 +393,7 @@ def curves_by_agent(
     results: StudyResults, environment: str
 ) -> dict[tuple[str, str], list[pd.DataFrame]]:
     """The learning curves of runs on an environment, by agent and kind."""
-    table = results.curves
-    table = table[table["environment"] == environment]
+    table = results.curves[results.curves["environment"] == environment]
     found: dict[tuple[str, str], list[pd.DataFrame]] = {}
     for (agent, kind, _), rows in table.groupby(["agent", "kind", "seed"]):
         found.setdefault((str(agent), str(kind)), []).append(rows)
@@ -411,12 +403,7 @@ def curves_by_agent(
 def mean_curve(
     curves: Sequence[pd.DataFrame], by: str, bounds: Bounds = UNBOUNDED
 ) -> tuple[Floats, Band] | None:
-    """The mean learning curve of an agent over its seeds.
-
-    Args:
-        curves: the curves of its runs, from `curves_by_agent`.
-        by: ``"step"``, ``"episode"`` or ``"seconds"``.
-        bounds: the least and the greatest possible return.
+    """The mean of curves of `curves_by_agent`, by ``"step"``, ``"episode"`` or ``"seconds"``.
 
     Returns:
         The points, shape (n,), and the means there with intervals; None without runs, or if a run

@@ -76,13 +76,11 @@ class AgentSpec:
 
     label: str  #: its name in tables and figures
     algo: str  #: its name in the table of agents
-    #: Hyperparameters that override those of its file.
-    settings: dict[str, Any] = field(default_factory=dict)
-    #: Whether to start from the entry of ``hyperparams/<algo>.yml``; otherwise from the defaults of
-    #: its constructor.
-    tuned: bool = True
-    #: Another file of hyperparameters to start from; None for the shipped one.
-    conf_file: Path | None = None
+    settings: dict[str, Any] = field(default_factory=dict)  #: which override those of its file
+    tuned: bool = (
+        True  #: whether to start from the shipped file, or from the constructor's defaults
+    )
+    conf_file: Path | None = None  #: another file of hyperparameters to start from
     summary: str = ""  #: a short description for the report
     where: str = field(default="", compare=False)  #: its place in a study file, for messages
     group: str = ""  #: for a member of a sweep, the common label
@@ -95,8 +93,7 @@ class EnvironmentSpec:
 
     label: str  #: its name in tables and figures
     env_id: str  #: its Gymnasium id
-    #: Hyperparameters of every agent here, such as ``env_kwargs`` and ``n_timesteps``, which
-    #: override those of the agents' files.
+    #: Hyperparameters of every agent here, which override those of the agents' files.
     settings: dict[str, Any] = field(default_factory=dict)
     map_name: str = ""  #: the file of its map, if the label names it
 
@@ -112,11 +109,8 @@ class EnvironmentSpec:
 class QuickSpec:
     """The reduction of a study for a quick look."""
 
-    #: The number of seeds; None for 2, or 1 with more than ten pairs of agent and environment.
-    seeds: int | None = None
-    #: Share of each run's steps or episodes; None for 200,000 steps at most, or 20,000 where the
-    #: agent is no table. An episode counts as 100 steps.
-    budget: float | None = None
+    seeds: int | None = None  #: None for 2, or 1 with more than `MOST_PAIRS`
+    budget: float | None = None  #: share of each run's budget; None: see `plan.QUICK_STEPS`
 
 
 @dataclass(frozen=True)
@@ -129,35 +123,27 @@ class StudySpec:
     environments: tuple[EnvironmentSpec, ...]  #: their environments
     n_seeds: int = 10  #: the number of seeds
     description: str = ""  #: its question, and earlier knowledge
-    #: Environment steps between two evaluations; None for twenty evaluations in a run.
-    eval_freq: int | None = None
+    eval_freq: int | None = None  #: steps between two evaluations; None for twenty in a run
     eval_episodes: int = 20  #: episodes of each sampled evaluation
     metric: Metric = "final"  #: the metric of the verdicts
-    #: Difference of the metric within which two agents are tied; None: 0.02 of the score;
-    #: nothing is tied where there is no score.
+    #: Difference of the metric within which two agents are tied; None: 0.02 of the score.
     margin: float | None = None
-    #: Whether runs of different agents with the same seed share their randomness, as on bandits
-    #: whose arms and rewards are drawn by the seed; if so, they are compared seed by seed.
+    #: Whether runs with the same seed share their randomness, as on bandits whose arms and rewards
+    #: are drawn by the seed; if so, agents are compared seed by seed.
     shared_randomness: bool = False
-    #: Return that counts as solved; None for the point at 95 % of that gap if the optimum is exact,
-    #: else for the environment's registered threshold.
-    threshold: float | None = None
-    #: Episodes per row in the table of training returns; 0 for no table.
-    episodes_table: int = 0
+    threshold: float | None = None  #: return that counts as solved; None: `results.threshold_of`
+    episodes_table: int = 0  #: episodes per row in the table of training returns; 0 for no table
     quick: QuickSpec = field(default_factory=QuickSpec)  #: its reduction for a quick look
     is_quick: bool = False  #: whether it is reduced
     gym_packages: tuple[str, ...] = ()  #: modules that the user typed
     tensorboard: bool = False  #: whether each run writes a TensorBoard log
     render_every: int = 0  #: episodes between two films; 0 for no films
-    #: Whether values and gradients are compared with exact ones at evaluations.
-    diagnose: bool = False
-    #: Whether the page links to pages that play the first training of each agent.
-    learning_pages: bool = False
+    diagnose: bool = False  #: whether evaluations compare values and gradients with exact ones
+    learning_pages: bool = False  #: whether the page links to pages that play first trainings
     figures: tuple[str, ...] = ("png", "svg")  #: formats of figures: "png", "svg", "pdf"
     run_timeout: float | None = None  #: seconds that each run may take; None for no limit
     first_seed: int = 0  #: the first seed; the others follow it
-    #: Label of the only agent to compare the others with; empty for all pairs.
-    against: str = ""
+    against: str = ""  #: label of the only agent to compare the others with; empty for all pairs
 
     @property
     def seeds(self) -> range:
@@ -237,15 +223,10 @@ def _by_label(value: Any) -> Any:
     return {key: entry or {} for key, entry in value.items()} if isinstance(value, dict) else value
 
 
-def _or_empty(value: Any) -> Any:
-    return {} if value is None else value
-
-
 _Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
 _FromZero = Annotated[int, BeforeValidator(_number), Field(ge=0)]
 _Float = Annotated[float, BeforeValidator(_number)]
-_Settings = Annotated[dict[str, Any], BeforeValidator(_or_empty)]
-_Sweep = Annotated[dict[str, Annotated[list[Any], Field(min_length=1)]], BeforeValidator(_or_empty)]
+_Sweep = dict[str, Annotated[list[Any], Field(min_length=1)]]
 
 
 class _Part(BaseModel):
@@ -269,7 +250,7 @@ class _Agent(_Open):
     tuned: bool | None = None
     conf_file: str | None = None
     summary: str = ""
-    sweep: _Sweep = {}
+    sweep: _Sweep | None = None
 
 
 class _Environment(_Open):
@@ -297,9 +278,9 @@ class _File(_Part):
     agents: Annotated[dict[str, _Agent], BeforeValidator(_by_label)] = Field({})
     environments: Annotated[dict[str, _Environment], BeforeValidator(_by_label)] = Field({})
     seeds: Annotated[_Seeds, BeforeValidator(_count)] = _Seeds()
-    settings: _Settings = {}
+    settings: dict[str, Any] = {}
     sweep: _Sweep = {}
-    quick: Annotated[_Quick, BeforeValidator(_or_empty)] = _Quick()
+    quick: _Quick = _Quick()
     n_timesteps: _Count | None = None
     n_episodes: _Count | None = None
     tuned: bool = True
@@ -314,6 +295,7 @@ class _File(_Part):
     run_timeout: Annotated[float, BeforeValidator(_seconds)] | None = None
 
 
+_LISTS = ("agents", "environments")
 # Keys that mean the same as fields of `StudySpec`.
 _SAME = (
     *("description", "eval_freq", "eval_episodes", "metric", "margin", "shared_randomness"),
@@ -328,17 +310,18 @@ class _Lines:
     path: Path
     lines: Mapping[tuple[str | int, ...], int]
 
+    def known(self, *keys: str | int) -> tuple[str | int, ...]:
+        """The keys of a value, or of what it is in."""
+        parts = (keys[:n] for n in range(len(keys), 0, -1))
+        return next((part for part in parts if part in self.lines), ())
+
     def at(self, *keys: str | int) -> str:
         """The place of a value, or of what it is in, as ``file:line``."""
-        known = (keys[:n] for n in range(len(keys), 0, -1) if keys[:n] in self.lines)
-        return f"{self.path}:{self.lines[found] if (found := next(known, None)) else 1}"
+        return f"{self.path}:{self.lines.get(self.known(*keys), 1)}"
 
 
 def find_study(given: str) -> Path:
-    """Find a study file: the given path, or else the shipped study of that name.
-
-    Args:
-        given: a path; for a shipped study also ``mine-maze`` or ``studies/mine-maze.yml``.
+    """The given path, or that of a shipped study such as ``mine-maze``, ``studies/mine-maze.yml``.
 
     Raises:
         UserError: if it is a plain name, and neither exists.
@@ -364,17 +347,11 @@ def read_study(path: Path) -> StudySpec:
     if not (isinstance(data, dict) and all(isinstance(key, str) for key in data)):
         raise UserError(f"{document.at()}: a study must map names to values")
     # What is not given is read too: lists of names that are missing.
-    data = {
-        "agents": None,
-        "environments": None,
-        **{k: v for k, v in data.items() if v is not None},
-    }
+    data = dict.fromkeys(_LISTS) | {k: v for k, v in data.items() if v is not None}
     try:
         file = _File.model_validate(data)
     except ValidationError as error:
         raise _in_one_line(document, error) from None
-    for keys in ((), ("settings",), *((p, label) for p in _LISTS for label in getattr(file, p))):
-        _check_budget(document, data, keys)
     given = {key: value for key in BUDGETS if (value := getattr(file, key)) is not None}
     return StudySpec(
         name=path.stem,
@@ -388,7 +365,6 @@ def read_study(path: Path) -> StudySpec:
     )
 
 
-_LISTS = ("agents", "environments")
 _PARTS: Mapping[tuple[str, ...], type[_Part]] = {(): _File, ("quick",): _Quick, ("seeds",): _Seeds}
 
 
@@ -410,9 +386,7 @@ def _in_one_line(document: _Lines, error: ValidationError) -> UserError:
     first = error.errors()[0]
     keys = tuple(key for key in first["loc"] if key != "[key]")
     place, value = document.at(*keys), first["input"]
-    key = next(
-        (k for n, k in enumerate(keys[::-1]) if keys[: len(keys) - n] in document.lines), keys[0]
-    )
+    key = (document.known(*keys) or keys)[-1]
     if first["type"] == "extra_forbidden":
         known = _PARTS[tuple(map(str, keys[:-1]))].model_fields
         return unknown(f"{place}: unknown key", str(key), known)
@@ -425,31 +399,16 @@ def _in_one_line(document: _Lines, error: ValidationError) -> UserError:
     return UserError(f"{place}: {key} {reason}, not {shown(value)}")
 
 
-def _check_budget(document: _Lines, data: Mapping[str, Any], keys: tuple[str, ...]) -> None:
-    """Refuse two budgets in one mapping."""
-    inner: Any = data
-    for key in keys:
-        inner = inner.get(key) if isinstance(inner, dict) else None
-    if isinstance(inner, dict) and all(inner.get(key) is not None for key in BUDGETS):
-        place = document.at(*keys, BUDGETS[1])
-        raise UserError(f"{place}: give {' or '.join(BUDGETS)}, not both")
-
-
 def _agents(document: _Lines, file: _File) -> list[AgentSpec]:
     agents: list[AgentSpec] = []
     for label, entry in file.agents.items():
-        keys = ("agents", label)
-        algo = label if entry.algo is None else entry.algo
+        keys, algo = ("agents", label), label if entry.algo is None else entry.algo
         if algo not in ALGORITHMS:
             raise unknown(f"{document.at(*keys, 'algo')}: unknown agent", algo, ALGORITHMS)
-        conf_file = None
-        if entry.conf_file is not None:
-            place = f"{document.at(*keys, 'conf_file')}: conf_file"
-            conf_file = document.path.parent / entry.conf_file
-            if entry.tuned is False:
-                raise UserError(f"{place} and tuned: false contradict each other: leave one out")
-            if not conf_file.is_file():
-                raise UserError(f"{place}: there is no file {conf_file}")
+        conf_file = None if entry.conf_file is None else document.path.parent / entry.conf_file
+        if conf_file is not None and not conf_file.is_file():
+            place = document.at(*keys, "conf_file")
+            raise UserError(f"{place}: conf_file: there is no file {conf_file}")
         agent = AgentSpec(
             label,
             algo,
@@ -459,7 +418,7 @@ def _agents(document: _Lines, file: _File) -> list[AgentSpec]:
             summary=entry.summary,
             where=document.at(*keys),
         )
-        agents += swept(agent, {**file.sweep, **entry.sweep})
+        agents += swept(agent, {**file.sweep, **(entry.sweep or {})})
     if len({agent.group for agent in agents}) == 1 and agents[0].swept:
         agents = [replace(a, label=a.label.removeprefix(f"{a.group} with ")) for a in agents]
     return agents

@@ -56,7 +56,6 @@ MISTAKES = [
     (BASE + "run_timeout: -1\n", 3, "run_timeout must be a time"),
     (BASE + "quick:\n  budget: 0\n", 4, "budget must be greater than 0"),
     (BASE + "quick:\n  sed: 0\n", 4, "unknown key 'sed': did you mean 'seeds'?"),
-    (BASE + "n_timesteps: 5\nn_episodes: 5\n", 4, "give n_timesteps or n_episodes, not both"),
     (BASE + "sweep:\n  gamma: []\n", 4, "gamma must have at least 1 item"),
     ("agents: [dqn]\n", 1, "environments must list at least one name"),
     (TAXI + "agents: [dqn, dqn]\n", 2, "agents names one of them twice"),
@@ -252,6 +251,7 @@ def test_the_agents_settings_go_over_the_environments_and_those_over_the_file():
 
 UNTRAINABLE = [
     ("qlearning", {"n_timesteps": None}, "no budget"),
+    ("qlearning", {"n_timesteps": 5, "n_episodes": 5}, "give n_timesteps or n_episodes, not both"),
     ("linucb", {}, "does not fit FrozenLake-v1"),
     ("qlearning", {"env_kwargs": {"slipery": True}}, "slipery"),
     ("qlearning", {"learning_rat": 0.1}, r"did you mean 'learning_rate'\?"),
