@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields, replace
@@ -110,7 +111,10 @@ def pull_statistics(
     with np.errstate(invalid="ignore"):
         shares = counts / counts.sum(axis=1, keepdims=True)
     n_runs, empty = len(arms), np.empty((0, 0))
-    mean, std = _mean_and_std(empty[None] if estimates is None else estimates)
+    estimates = empty[None] if estimates is None else estimates
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
+        # Without nan; nan if no run has a figure.
+        mean, std = np.nanmean(estimates, axis=0), np.nanstd(estimates, axis=0)
     return PullStatistics(
         pulls=points,
         reward=_mean_since_last(rewards.mean(axis=0, dtype=np.float64), points),
@@ -129,16 +133,6 @@ def pull_statistics(
         moments=np.array(moments, dtype=np.int64),
         posteriors=np.empty((0, 0, 0, 2)) if posteriors is None else posteriors[0],
     )
-
-
-def _mean_and_std(estimates: Floats) -> tuple[Floats, Floats]:
-    """Mean and deviation over runs, without nan; nan if no run has a figure."""
-    is_known = ~np.isnan(estimates)
-    with np.errstate(invalid="ignore"):
-        n_known = is_known.sum(axis=0)
-        mean = np.where(is_known, estimates, 0.0).sum(axis=0) / n_known
-        squares = np.where(is_known, estimates - mean, 0.0) ** 2
-        return mean, np.sqrt(squares.sum(axis=0) / n_known)
 
 
 def _mean_since_last(by_pull: Floats, points: Ints) -> Floats:

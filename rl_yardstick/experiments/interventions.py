@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.results import StudyResults
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from rl_yardstick.mdp.transition_model import Floats
@@ -74,13 +73,6 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
         n_seeds=SEEDS,
         gym_packages=tuple(spec.gym_packages),
     )
-
-
-def relative_length(runs: Sequence[PlannedRun], spec: TrainSpec, steps: int) -> float:
-    """The length of all runs, in runs of ``spec``, which took so many steps."""
-    episode = steps / (spec.n_episodes or steps)  # 1 where the length is unknown
-    budgets = [run.spec.n_timesteps or (run.spec.n_episodes or 0) * episode for run in runs]
-    return sum(budgets) / steps
 
 
 def tried(results: StudyResults) -> list[Tried]:

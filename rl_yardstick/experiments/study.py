@@ -10,13 +10,12 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.pipeline.environments import check_env_id, map_name
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
-from rl_yardstick.pipeline.files import LONGEST_NAME, portable_name, read_text
+from rl_yardstick.pipeline.files import LONGEST_NAME, portable_name
 from rl_yardstick.pipeline.settings import BUDGETS, ENV_KWARGS, override, read_yaml
 
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
@@ -82,7 +81,7 @@ class AgentSpec:
     )
     conf_file: Path | None = None  #: another file of hyperparameters to start from
     summary: str = ""  #: a short description for the report
-    where: str = field(default="", compare=False)  #: its place in a study file, for messages
+    where: str = field(default="", compare=False)  #: the file with its settings, for messages
     group: str = ""  #: for a member of a sweep, the common label
     swept: dict[str, Any] = field(default_factory=dict)  #: its values of the swept settings
 
@@ -303,23 +302,6 @@ _SAME = (
 )
 
 
-@dataclass(frozen=True)
-class _Lines:
-    """A study file, and the line number of each value by its keys."""
-
-    path: Path
-    lines: Mapping[tuple[str | int, ...], int]
-
-    def known(self, *keys: str | int) -> tuple[str | int, ...]:
-        """The keys of a value, or of what it is in."""
-        parts = (keys[:n] for n in range(len(keys), 0, -1))
-        return next((part for part in parts if part in self.lines), ())
-
-    def at(self, *keys: str | int) -> str:
-        """The place of a value, or of what it is in, as ``file:line``."""
-        return f"{self.path}:{self.lines.get(self.known(*keys), 1)}"
-
-
 def find_study(given: str) -> Path:
     """The given path, or that of a shipped study such as ``mine-maze``, ``studies/mine-maze.yml``.
 
@@ -343,21 +325,20 @@ def read_study(path: Path) -> StudySpec:
         UserError: if it cannot be read, or contains unknown or invalid settings.
     """
     data = read_yaml(path)
-    document = _Lines(path, dict(_key_lines(yaml.compose(read_text(path), yaml.SafeLoader), ())))
     if not (isinstance(data, dict) and all(isinstance(key, str) for key in data)):
-        raise UserError(f"{document.at()}: a study must map names to values")
+        raise UserError(f"{path}: a study must map names to values")
     # What is not given is read too: lists of names that are missing.
     data = dict.fromkeys(_LISTS) | {k: v for k, v in data.items() if v is not None}
     try:
         file = _File.model_validate(data)
     except ValidationError as error:
-        raise _in_one_line(document, error) from None
+        raise _in_one_line(path, error) from None
     given = {key: value for key in BUDGETS if (value := getattr(file, key)) is not None}
     return StudySpec(
         name=path.stem,
         title=file.title or path.stem,
-        agents=tuple(_agents(document, file)),
-        environments=tuple(_environments(document, file, layered(file.settings, given))),
+        agents=tuple(_agents(path, file)),
+        environments=tuple(_environments(path, file, layered(file.settings, given))),
         n_seeds=file.seeds.count,
         first_seed=file.seeds.first,
         quick=QuickSpec(file.quick.seeds, file.quick.budget),
@@ -368,28 +349,13 @@ def read_study(path: Path) -> StudySpec:
 _PARTS: Mapping[tuple[str, ...], type[_Part]] = {(): _File, ("quick",): _Quick, ("seeds",): _Seeds}
 
 
-def _key_lines(node: Any, keys: tuple[str | int, ...]) -> Iterator[tuple[Any, int]]:
-    """The line numbers, from 1, of the values below a node; items of lists also by their text."""
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            inner = (*keys, str(key.value))
-            yield from _key_lines(value, inner)
-            yield inner, key.start_mark.line + 1
-    elif isinstance(node, yaml.SequenceNode):
-        for item in node.value:
-            if isinstance(item, yaml.ScalarNode):
-                yield (*keys, str(item.value)), item.start_mark.line + 1
-
-
-def _in_one_line(document: _Lines, error: ValidationError) -> UserError:
-    """The first mistake, with its place."""
+def _in_one_line(path: Path, error: ValidationError) -> UserError:
+    """The first mistake, with the keys that lead to it."""
     first = error.errors()[0]
-    keys = tuple(key for key in first["loc"] if key != "[key]")
-    place, value = document.at(*keys), first["input"]
-    key = (document.known(*keys) or keys)[-1]
+    *outer, key = [str(key) for key in first["loc"] if key != "[key]"]
+    place, value = ": ".join([str(path), *outer]), first["input"]
     if first["type"] == "extra_forbidden":
-        known = _PARTS[tuple(map(str, keys[:-1]))].model_fields
-        return unknown(f"{place}: unknown key", str(key), known)
+        return unknown(f"{place}: unknown key", key, _PARTS[tuple(outer)].model_fields)
     if first["type"] == "literal_error":
         return unknown(f"{place}: unknown {key}", str(value), METRICS)
     if first["type"] == "value_error":
@@ -399,16 +365,15 @@ def _in_one_line(document: _Lines, error: ValidationError) -> UserError:
     return UserError(f"{place}: {key} {reason}, not {shown(value)}")
 
 
-def _agents(document: _Lines, file: _File) -> list[AgentSpec]:
+def _agents(path: Path, file: _File) -> list[AgentSpec]:
     agents: list[AgentSpec] = []
     for label, entry in file.agents.items():
-        keys, algo = ("agents", label), label if entry.algo is None else entry.algo
+        algo = label if entry.algo is None else entry.algo
         if algo not in ALGORITHMS:
-            raise unknown(f"{document.at(*keys, 'algo')}: unknown agent", algo, ALGORITHMS)
-        conf_file = None if entry.conf_file is None else document.path.parent / entry.conf_file
+            raise unknown(f"{path}: unknown agent", algo, ALGORITHMS)
+        conf_file = None if entry.conf_file is None else path.parent / entry.conf_file
         if conf_file is not None and not conf_file.is_file():
-            place = document.at(*keys, "conf_file")
-            raise UserError(f"{place}: conf_file: there is no file {conf_file}")
+            raise UserError(f"{path}: {label}: conf_file: there is no file {conf_file}")
         agent = AgentSpec(
             label,
             algo,
@@ -416,7 +381,7 @@ def _agents(document: _Lines, file: _File) -> list[AgentSpec]:
             tuned=file.tuned if entry.tuned is None else entry.tuned,
             conf_file=conf_file,
             summary=entry.summary,
-            where=document.at(*keys),
+            where=str(path),
         )
         agents += swept(agent, {**file.sweep, **(entry.sweep or {})})
     if len({agent.group for agent in agents}) == 1 and agents[0].swept:
@@ -424,14 +389,12 @@ def _agents(document: _Lines, file: _File) -> list[AgentSpec]:
     return agents
 
 
-def _environments(
-    document: _Lines, file: _File, shared: Mapping[str, Any]
-) -> Iterator[EnvironmentSpec]:
+def _environments(path: Path, file: _File, shared: Mapping[str, Any]) -> Iterator[EnvironmentSpec]:
     for label, entry in file.environments.items():
         env_id = label if entry.id is None else entry.id
         try:
             check_env_id(env_id)
         except UserError as error:
-            raise UserError(f"{document.at('environments', label, 'id')}: {error}") from error
+            raise UserError(f"{path}: {error}") from error
         as_it_comes = AS_IT_COMES if entry.as_it_comes else {}
         yield EnvironmentSpec(label, env_id, layered(shared, {**as_it_comes, **entry.settings}))

@@ -45,32 +45,32 @@ def read(tmp_path):
 BASE = "agents: [qlearning]\nenvironments: [FrozenLake-v1]\n"
 TAXI = "environments: [Taxi-v4]\n"
 
-# The text, the line that is named, and what is said of it.
+# The text, and what is said of it.
 MISTAKES = [
-    ("", 1, "a study must map names to values"),
-    (BASE + "seed: 3\n", 3, "unknown key 'seed': did you mean 'seeds'?"),
-    (BASE + "\nseeds: many\n", 4, "seeds must be a valid integer, not 'many'"),
-    (BASE + "seeds: true\n", 3, "seeds must be a number, not True"),
-    (BASE + "seeds:\n  first: -1\n", 4, "first must be greater than or equal to 0, not -1"),
-    (BASE + "metric: finl\n", 3, "did you mean 'final'?"),
-    (BASE + "run_timeout: -1\n", 3, "run_timeout must be a time"),
-    (BASE + "quick:\n  budget: 0\n", 4, "budget must be greater than 0"),
-    (BASE + "quick:\n  sed: 0\n", 4, "unknown key 'sed': did you mean 'seeds'?"),
-    (BASE + "sweep:\n  gamma: []\n", 4, "gamma must have at least 1 item"),
-    ("agents: [dqn]\n", 1, "environments must list at least one name"),
-    (TAXI + "agents: [dqn, dqn]\n", 2, "agents names one of them twice"),
-    (TAXI + "agents: [sarsa, qlerning]\n", 2, "'qlerning': did you mean 'qlearning'?"),
-    (TAXI + "agents:\n  dqn:\n    conf_file: no.yml\n", 4, "conf_file: there is no file "),
-    ("agents: [dqn]\nenvironments: {ice: {id: FrozenLak-v1}}\n", 2, "mean 'FrozenLake-v1'"),
+    ("", "a study must map names to values"),
+    (BASE + "seed: 3\n", "unknown key 'seed': did you mean 'seeds'?"),
+    (BASE + "\nseeds: many\n", "seeds: count must be a valid integer, not 'many'"),
+    (BASE + "seeds: true\n", "seeds: count must be a number, not True"),
+    (BASE + "seeds:\n  first: -1\n", "seeds: first must be greater than or equal to 0, not -1"),
+    (BASE + "metric: finl\n", "did you mean 'final'?"),
+    (BASE + "run_timeout: -1\n", "run_timeout must be a time"),
+    (BASE + "quick:\n  budget: 0\n", "quick: budget must be greater than 0"),
+    (BASE + "quick:\n  sed: 0\n", "quick: unknown key 'sed': did you mean 'seeds'?"),
+    (BASE + "sweep:\n  gamma: []\n", "sweep: gamma must have at least 1 item"),
+    ("agents: [dqn]\n", "environments must list at least one name"),
+    (TAXI + "agents: [dqn, dqn]\n", "agents names one of them twice"),
+    (TAXI + "agents: [sarsa, qlerning]\n", "'qlerning': did you mean 'qlearning'?"),
+    (TAXI + "agents:\n  dqn:\n    conf_file: no.yml\n", "dqn: conf_file: there is no file "),
+    ("agents: [dqn]\nenvironments: {ice: {id: FrozenLak-v1}}\n", "mean 'FrozenLake-v1'"),
 ]
 
 
-@pytest.mark.parametrize(("text", "line", "complaint"), MISTAKES)
-def test_a_mistake_is_one_line_with_file_and_line(read, text, line, complaint):
+@pytest.mark.parametrize(("text", "complaint"), MISTAKES)
+def test_a_mistake_is_one_line_with_the_file(read, text, complaint):
     with pytest.raises(UserError) as error:
         read(text)
     message = str(error.value)
-    assert re.match(rf".*lakes\.yml:{line}:", message)
+    assert re.match(r".*lakes\.yml: ", message)
     assert complaint in message
 
 
@@ -113,7 +113,7 @@ def test_agents_and_environments(read):
     assert (slow.label, slow.algo, slow.tuned) == ("slow", "qlearning", False)
     assert (slow.summary, slow.settings) == ("creeps", {"learning_rate": 0.01})
     assert (sarsa.algo, sarsa.tuned) == ("sarsa", True)
-    assert slow.where.endswith("lakes.yml:8")
+    assert slow.where.endswith("lakes.yml")
     small, dry = study.environments
     usual = {"n_timesteps": 500, "gamma": 0.9, "env_kwargs": {"map_name": "4x4"}}
     assert (small.env_id, small.settings) == ("FrozenLake-v1", usual)
@@ -261,8 +261,8 @@ UNTRAINABLE = [
 
 @pytest.mark.parametrize(("algo", "settings", "complaint"), UNTRAINABLE)
 def test_what_cannot_be_trained_is_refused_beforehand(tmp_path, algo, settings, complaint):
-    agents = AgentSpec("good", "sarsa"), AgentSpec("bad", algo, settings, where="lakes.yml:7")
-    with pytest.raises(UserError, match=rf"^lakes\.yml:7: bad on FrozenLake-v1: .*{complaint}"):
+    agents = AgentSpec("good", "sarsa"), AgentSpec("bad", algo, settings, where="lakes.yml")
+    with pytest.raises(UserError, match=rf"^lakes\.yml: bad on FrozenLake-v1: .*{complaint}"):
         plan(study_of(*agents, n_seeds=2), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
