@@ -193,9 +193,10 @@ def tried_changes(
     """Train four seeds as shipped, as it is and with each change; return the returns as JSON."""
     from rl_yardstick.commands.compare import Job, do_study, held
     from rl_yardstick.commands.terminal import say
-    from rl_yardstick.experiments.interventions import intervention_study, tried
     from rl_yardstick.experiments.plan import StudyRecord, plan, specs_of
     from rl_yardstick.experiments.pool import Workers, available_cores
+    from rl_yardstick.experiments.results import tried
+    from rl_yardstick.experiments.study import intervention_study
     from rl_yardstick.pipeline.run import Stop
     from rl_yardstick.report.why import tried_lines
 

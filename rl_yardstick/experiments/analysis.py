@@ -88,8 +88,7 @@ class Evidence:
 def evidence_of(results: StudyResults) -> list[Evidence]:
     """Collect the evidence on each environment on which a run has finished."""
     there = set(results.summary["environment"])
-    labels = [environment.label for environment in results.study.environments]
-    return [_evidence_on(results, label) for label in labels if label in there]
+    return [_evidence_on(results, e.label) for e in results.study.environments if e.label in there]
 
 
 def _evidence_on(results: StudyResults, environment: str) -> Evidence:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -61,9 +61,8 @@ class PullStatistics:
 
     def save(self, path: Path) -> None:
         """Write all arrays to a NumPy archive."""
-        arrays: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         with replacing(path) as beside:
-            np.savez(beside, allow_pickle=False, **arrays)
+            np.savez(beside, allow_pickle=False, **vars(self))
 
     @classmethod
     def load(cls, path: Path) -> PullStatistics:

@@ -111,11 +111,9 @@ def cross_fit(
 
 # --- the estimators -------------------------------------------------------------------------------
 
-# By how many standard errors the mean weight may differ from 1 before the log is refused. Chance
-# causes this only if the log has almost none of the policy's actions.
-MOST_ERRORS = 5.0
-# An additional tolerance, because files round propensities.
-ROUNDED = 0.02
+# By how many standard errors the mean weight may differ from 1 before the log is refused, and a
+# tolerance beside, because files round propensities.
+MOST_ERRORS, ROUNDED = 5.0, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,12 +179,9 @@ def difference_in_value(
 
     The standard deviation of the terms has a lower bound: its value if rewards had the same noise
     everywhere. If few pulls inform a choice, all may have had equal rewards by chance, and the
-    terms alone would look too certain.
-
-    The intervals of all ``n_comparisons`` hold simultaneously with 95 %.
+    terms alone would look too certain. All ``n_comparisons`` hold together with 95 %.
     """
-    confidence = 1 - 0.05 / n_comparisons
-    found = mean_reward(first.doubly_robust - second.doubly_robust, confidence)
+    found = mean_reward(first.doubly_robust - second.doubly_robust, 1 - 0.05 / n_comparisons)
     apart = first.weights - second.weights
     variance = float((apart**2).mean() * (first.errors**2).mean()) / len(apart)
     half = float(stats.t.isf(0.05 / n_comparisons / 2, len(apart) - 1)) * np.sqrt(variance)

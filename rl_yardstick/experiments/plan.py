@@ -137,13 +137,13 @@ def plan(
     what is trained, by default `specs_of` the study.
     """
     specs = specs or specs_of(study)
-    folders = {environment.label: environment.folder for environment in study.environments}
+    folders = {one.label: one.folder for one in study.environments}
     batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
     with_memory = {environment for (_, environment), spec in specs.items() if remembers(spec)}
     planned = []
     for seed, (labels, spec) in product(study.seeds, specs.items()):
-        n_seeds, is_first = (counts or {}).get(labels, study.n_seeds), seed == study.first_seed
-        is_batch = labels in batches
+        n_seeds, is_batch = (counts or {}).get(labels, study.n_seeds), labels in batches
+        is_first = seed == study.first_seed
         if not is_first and (is_batch or seed - study.first_seed >= n_seeds):
             continue
         # From 1, because 0 means the newest run in rl_zoo3's tools.
@@ -216,13 +216,12 @@ def _is_batch(spec: TrainSpec) -> bool:
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
     check_agent(agent.algo)
     entry, origins = _entry(agent, environment)
-    name = map_name(environment.env_id, entry)
     spec = read_spec(
         agent.algo,
         environment.env_id,
         with_files_read(environment.env_id, entry),
         origins=origins,
-        map_name=name,
+        map_name=map_name(environment.env_id, entry),
         pictures=False,
         eval_freq=study.eval_freq,
         eval_episodes=study.eval_episodes,
@@ -312,9 +311,7 @@ class StudyRecord:
             own = {"gym_packages": [*study.gym_packages], "trained_agent": None}
             own |= {"tensorboard_log": None, "watch_learning": None}
             specs = {
-                (str(one["agent"]), str(one["environment"])): TrainSpec.model_validate(
-                    {**one["spec"], **own}
-                )
+                (str(one["agent"]), str(one["environment"])): TrainSpec(**{**one["spec"], **own})
                 for one in data["specs"]
             }
             return cls(study, specs, tuple(map(int, data["looks"])))
@@ -372,12 +369,9 @@ def look_sizes(first: int, most: int) -> tuple[int, ...]:
 
 def other_settings(planned: Sequence[PlannedRun]) -> list[tuple[PlannedRun, dict[str, Any]]]:
     """The finished runs in the folders that have other settings than planned, and these."""
-    found = []
-    for run in planned:
-        recorded = run.recorded()
-        if recorded.get("state") == FINISHED and (there := run.differences(recorded)):
-            found.append((run, there))
-    return found
+    recorded = [(run, run.recorded()) for run in planned]
+    finished = [(run, found) for run, found in recorded if found.get("state") == FINISHED]
+    return [(run, there) for run, found in finished if (there := run.differences(found))]
 
 
 # --- the seeds of a study on which its settings were tuned, as far as known -----------------------
@@ -392,21 +386,17 @@ Seeds = frozenset[int]
 class TuningSeeds:
     """The origin of a study's settings, and the seeds of the study on which they were tuned."""
 
-    #: By agent, the seeds of the study on which its settings in ``hyperparams/`` were tuned; empty
-    #: for agents with their constructor's defaults.
+    #: By agent, those of its settings in ``hyperparams/``; empty for its constructor's defaults.
     shipped: Mapping[str, Seeds]
     files: Mapping[str, Seeds]  #: likewise, by the name of a user's file that lists seeds
     unknown: tuple[str, ...]  #: agents whose settings have unknown tuning seeds
-    #: Agents whose settings were tuned with other environment arguments.
-    elsewhere: tuple[str, ...] = ()
+    elsewhere: tuple[str, ...] = ()  #: agents tuned with other environment arguments
 
 
 def tuning_seeds(study: StudySpec) -> TuningSeeds:
     """Find the tuning seeds for all agents of a study on all its environments."""
-    shipped: dict[str, Seeds] = {}
-    files: dict[str, Seeds] = {}
-    unknown: dict[str, None] = {}
-    elsewhere: dict[str, None] = {}
+    shipped, files = dict[str, Seeds](), dict[str, Seeds]()
+    unknown, elsewhere = dict[str, None](), dict[str, None]()
 
     @cache
     def known(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] | None:

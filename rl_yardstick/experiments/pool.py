@@ -266,9 +266,9 @@ def progress(console: Console, total: int, what: str = "runs") -> Iterator[Calla
     """
     begun = told_at = time.monotonic()
     columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    failed = TextColumn("{task.description}")
+    failures = TextColumn("{task.description}")
     is_live = console.is_terminal and total > 0
-    with Progress(*columns, failed, console=console, transient=True, disable=not is_live) as bar:
+    with Progress(*columns, failures, console=console, transient=True, disable=not is_live) as bar:
         task, n_done = bar.add_task("", total=total), 0
 
         def advance(n_failed: int) -> None:
@@ -278,8 +278,7 @@ def progress(console: Console, total: int, what: str = "runs") -> Iterator[Calla
             bar.update(task, advance=1, description=words.removeprefix(", "))
             now = time.monotonic()
             if not is_live and (n_done == total or now - told_at > SECONDS_BETWEEN_LINES):
-                told_at = now
-                text = f"{n_done} of {total} {what} in {now - begun:.0f} s{words}"
-                console.print(text, highlight=False)
+                told_at, done = now, f"{n_done} of {total} {what}"
+                console.print(f"{done} in {now - begun:.0f} s{words}", highlight=False)
 
         yield advance

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.experiments.bandits import STATISTICS_FILE, PullStatistics, read_pulls, run_regret
 from rl_yardstick.experiments.plan import PlannedRun
-from rl_yardstick.experiments.study import StudySpec
+from rl_yardstick.experiments.study import AS_IT_IS, SHIPPED, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.curve_pictures import MEANINGS, read_diagnosis
 from rl_yardstick.pipeline.errors import UserError, one_line
@@ -199,28 +199,24 @@ class StudyResults:
     failures: Mapping[Path, str] = field(default_factory=dict)
 
 
-# Columns of `StudyResults.summary`, explained in docs/compare.md; returns are undiscounted sums.
-RUN_COLUMNS = (
-    *("agent", "algo", "environment", "env_id", "seed"),
-    *("final", "final_std", "final_length", "success_rate", "exact"),
-    *("optimum", "optimum_at_least", "optimum_is_proven", "baseline", "gap", "score"),
-    *("acts_by", "stochastic_return", "discount", "discounted_return", "discounted_optimum"),
-    *("best", "best_timesteps", "area", "training", "last_episodes", "regret", "threshold"),
-    *("steps_to_threshold", "steps_to_stay", "episodes_to_threshold", "episodes_to_stay"),
-    *("n_timesteps", "n_episodes", "seconds", "cpu_seconds", "engine", "path"),
-)
-
 # Further columns, if some environment is partially observable: the optimum of agents that see the
 # state, and the input of the policies that reach ``optimum``, "observation" or "memory".
 HIDDEN_COLUMNS = ("full_optimum", "measured_by")
-
 # Columns with the same name in ``run.json``, under ``final`` and beside it.
 _OF_FINAL = (
     *("success_rate", "exact", "optimum", "optimum_at_least", "optimum_is_proven", "baseline"),
     *("gap", "score", "acts_by", "stochastic_return", "discount", "discounted_return"),
-    *("discounted_optimum", *HIDDEN_COLUMNS),
+    "discounted_optimum",
 )
 _OF_RUN = ("best_timesteps", "n_timesteps", "seconds", "cpu_seconds", "engine")
+# Columns of `StudyResults.summary`, explained in docs/compare.md; returns are undiscounted sums.
+RUN_COLUMNS = (
+    *("agent", "algo", "environment", "env_id", "seed"),
+    *("final", "final_std", "final_length", *_OF_FINAL),
+    *("best", "best_timesteps", "area", "training", "last_episodes", "regret", "threshold"),
+    *("steps_to_threshold", "steps_to_stay", "episodes_to_threshold", "episodes_to_stay"),
+    *("n_timesteps", "n_episodes", "seconds", "cpu_seconds", "engine", "path"),
+)
 
 
 def read_results(
@@ -317,7 +313,7 @@ def _summary_row(
         "final": final.get("mean_return"),
         "final_std": final.get("std_return"),
         "final_length": final.get("mean_length"),
-        **{name: final.get(name) for name in _OF_FINAL},
+        **{name: final.get(name) for name in (*_OF_FINAL, *HIDDEN_COLUMNS)},
         "best": recorded["best_mean_return"],
         "area": _area(steps, values),
         "training": float(returns.mean()),
@@ -358,23 +354,15 @@ def speed_figures(
 ) -> dict[str, float | None]:
     """The columns of the summary on the threshold, from the curve of a run's evaluations."""
     threshold = threshold_of(study, env_id, final)
-    steps, values = evaluations["step"], evaluations["value"]
-    reached = stayed = float("nan")
-    if threshold is not None and len(steps):
-        reached = steps_to_threshold(steps, values, threshold)
-        stayed = steps_to_threshold(steps, values, threshold, to_stay=True)
-
-    def episodes_by(step: float) -> float:
-        there = np.isfinite(step)
-        return float(evaluations["episode"][np.searchsorted(steps, step)]) if there else step
-
-    return {
-        "threshold": threshold,
-        "steps_to_threshold": reached,
-        "steps_to_stay": stayed,
-        "episodes_to_threshold": episodes_by(reached),
-        "episodes_to_stay": episodes_by(stayed),
-    }
+    steps, values, found = evaluations["step"], evaluations["value"], {"threshold": threshold}
+    for name, to_stay in (("threshold", False), ("stay", True)):
+        step = episode = float("nan")
+        if threshold is not None and len(steps):
+            step = episode = steps_to_threshold(steps, values, threshold, to_stay=to_stay)
+        if np.isfinite(step):
+            episode = float(evaluations["episode"][np.searchsorted(steps, step)])
+        found |= {f"steps_to_{name}": step, f"episodes_to_{name}": episode}
+    return found
 
 
 # --- agents over their seeds ---------------------------------------------------------------------
@@ -387,6 +375,33 @@ def values_over_seeds(results: StudyResults, environment: str, column: str) -> d
     pivot = table.pivot(index="seed", columns="agent", values=column)
     pivot = pivot.reindex(index=results.study.seeds, columns=labels)
     return {str(agent): pivot[agent].to_numpy(dtype=np.float64, na_value=np.nan) for agent in pivot}
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A change and its results."""
+
+    change: str  #: as typed, or ``"as it is"``
+    returns: Floats  #: of the final policy by seed, NaN for runs that did not finish
+
+    @property
+    def finished(self) -> Floats:
+        """The returns of the runs that finished."""
+        return self.returns[~np.isnan(self.returns)]
+
+    @property
+    def mean(self) -> float:
+        """The mean return of the runs that finished; -inf without one."""
+        return float(self.finished.mean()) if len(self.finished) else -np.inf
+
+
+def tried(results: StudyResults) -> list[Tried]:
+    """The results of an `intervention_study`: as shipped, as it is, then by falling mean return."""
+    returns = values_over_seeds(results, results.study.environments[0].label, "final")
+    unchanged = (SHIPPED, f"{SHIPPED}, {AS_IT_IS}", AS_IT_IS)
+    ranks = {change: rank for rank, change in enumerate(unchanged)}
+    found = [Tried(change, values) for change, values in returns.items()]
+    return sorted(found, key=lambda one: (ranks.get(one.change, len(ranks)), -one.mean))
 
 
 def curves_by_agent(

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -13,10 +14,19 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from rl_yardstick.agents.registry import ALGORITHMS
+from rl_yardstick.pipeline.arguments import arguments_of
 from rl_yardstick.pipeline.environments import check_env_id, map_name
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
-from rl_yardstick.pipeline.files import LONGEST_NAME, portable_name
-from rl_yardstick.pipeline.settings import BUDGETS, ENV_KWARGS, override, read_yaml
+from rl_yardstick.pipeline.files import LONGEST_NAME, plain, portable_name
+from rl_yardstick.pipeline.settings import (
+    BUDGETS,
+    ENV_KWARGS,
+    override,
+    parse_assignments,
+    read_yaml,
+    shipped_hyperparams,
+)
+from rl_yardstick.pipeline.spec import TrainSpec
 
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
 METRICS = get_args(Metric)
@@ -202,11 +212,11 @@ def _number(value: Any) -> Any:
 
 def _seconds(value: Any) -> Any:
     """A time such as 90, 90s, 10m, 2h or 1d."""
-    found = re.fullmatch(r"([0-9.]+)\s*(|s|m|min|h|d)", str(value).strip())
-    unit = {"m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}.get(found[2], 1.0) if found else 0.0
-    if found is None or found[1].count(".") > 1 or not float(found[1]) * unit > 0:
+    found = re.fullmatch(r"(\d*\.?\d+)\s*(|s|m|min|h|d)", str(value).strip())
+    if found is None or not float(found[1]) > 0:
         raise ValueError(f"must be a time such as 90s, 10m or 2h, not {shown(value)}")
-    return float(found[1]) * unit
+    units = {"m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+    return float(found[1]) * units.get(found[2], 1.0)
 
 
 def _by_label(value: Any) -> Any:
@@ -398,3 +408,43 @@ def _environments(path: Path, file: _File, shared: Mapping[str, Any]) -> Iterato
             raise UserError(f"{path}: {error}") from error
         as_it_comes = AS_IT_COMES if entry.as_it_comes else {}
         yield EnvironmentSpec(label, env_id, layered(shared, {**as_it_comes, **entry.settings}))
+
+
+# --- changes of the settings of an agent, over four seeds, as evidence for causes -----------------
+
+SHIPPED, AS_IT_IS = "as shipped", "as it is"
+
+
+def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> StudySpec:
+    """Make a study of the agent of the run ``name``, as shipped, unchanged and with each change.
+
+    Changes are typed as ``key:value``, or several of these separated by spaces.
+
+    Raises:
+        UserError: if a change cannot be parsed.
+    """
+    own, shipped = spec.hyperparams, shipped_hyperparams(spec)
+    typed = {change: parse_assignments(change.split(), "--test") for change in changes}
+    settings = {change: layered(own, values) for change, values in typed.items()}
+    first = dict([*settings.items()][:1])  # the likeliest change is trained first
+    unchanged = {SHIPPED: shipped, AS_IT_IS: own}
+    if {**own, "engine": None} == {**shipped, "engine": None}:
+        unchanged = {f"{SHIPPED}, {AS_IT_IS}": own}
+    # Compiled code if possible, unless the settings name an engine.
+    has_auto = "=auto" in arguments_of(spec.algo).get("engine", ())
+    fast: dict[str, Any] = {"engine": "auto"} if has_auto else {}
+    agents = [
+        AgentSpec(change, spec.algo, {**fast, **values}, tuned=False)
+        for change, values in {**first, **unchanged, **settings}.items()
+    ]
+    # Two models of one name share a folder only if their settings are the same.
+    digest = sha256(repr(sorted(plain(own).items())).encode()).hexdigest()[:8]
+    environment = f"{spec.env_id} ({spec.map_name})" if spec.map_name else spec.env_id
+    return StudySpec(
+        name=file_name(f"explain_{name}_{digest}"),
+        title=f"What helps {spec.algo} on {environment}",
+        agents=tuple(agents),
+        environments=(EnvironmentSpec(environment, spec.env_id, map_name=spec.map_name),),
+        n_seeds=4,
+        gym_packages=tuple(spec.gym_packages),
+    )

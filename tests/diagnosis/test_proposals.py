@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from rl_yardstick.diagnosis.explanation import explanation
-from rl_yardstick.experiments.interventions import AS_IT_IS, SHIPPED, Tried, intervention_study
+from rl_yardstick.experiments.results import Tried
+from rl_yardstick.experiments.study import AS_IT_IS, SHIPPED, intervention_study
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.settings import override, parse_assignments, read_entry, read_spec
 from rl_yardstick.pipeline.training import make_agent
