@@ -55,10 +55,8 @@ class Evidence:
     #: By agent, the metric of its seeds, shape (n_seeds,): NaN for a missing run.
     values: Mapping[str, Floats] = field(default_factory=dict)
     seeds: Mapping[str, int] = field(default_factory=dict)  #: by agent, its planned seeds
-    #: The highest expected return of any policy, or an upper bound of it; None if unknown.
-    optimum: float | None
-    #: A lower bound of the optimum; None if ``optimum`` is exact or unknown.
-    optimum_at_least: float | None = None
+    optimum: float | None  #: the highest expected return of any policy, or an upper bound of it
+    optimum_at_least: float | None = None  #: a lower bound, if ``optimum`` is an upper one
     baseline: float | None  #: expected return of the best random or constant policy, or None
     threshold: float | None  #: the return that counts as solved, or None
     bounds: Bounds  #: the least and the greatest possible return
@@ -186,10 +184,8 @@ class OverallAnalysis:
     """The comparison of agents over all environments, by their scores."""
 
     scores: Mapping[str, Summary]  #: figures by agent, the best first
-    #: All pairs, better ranked agent first, by the means of their scores over environments; none
-    #: in a study that grows until it is decided.
-    pairs: tuple[Pair, ...]
-    best: Best | None  #: likewise None
+    pairs: tuple[Pair, ...]  #: better ranked agent first; none in a growing study
+    best: Best | None  #: None in a growing study
     thresholds: Floats  #: the scores of the profiles, shape (n,)
     profiles: Mapping[str, Floats]  #: by agent, the share of runs above each of these
 
@@ -257,9 +253,8 @@ class AgentAnalysis:
     success_rate: Estimate | None  #: of the final policy; None if not reported
     seconds: Estimate  #: processor time of training
     changes: tuple[str, ...] = ()  #: of the environment in training, in words
-    #: Exact return of the policy that acts in training, None if unknown, and its description.
-    stochastic: Estimate | None = None
-    acts_by: str = ""
+    stochastic: Estimate | None = None  #: exact return of the policy that acts in training
+    acts_by: str = ""  #: this policy in words
     #: Exact discounted return of the final policy, the agent's discount, and the optimum under it.
     discounted: Estimate | None = None
     discount: float | None = None
@@ -286,16 +281,14 @@ class EnvironmentAnalysis(Evidence):
     pairs: tuple[Pair, ...]  #: all pairs, better ranked agent first
     best: Best  #: the agents than which no other is shown to be better
     failure_threshold: float | None  #: the score below which a run failed; None if not defined
-    #: Missing runs by agent, including agents without a finished run.
-    missing: Mapping[str, int] = field(default_factory=dict)
+    missing: Mapping[str, int] = field(default_factory=dict)  #: runs, also by agents without one
     looks: tuple[int, ...] = ()  #: the seeds at each look, if the study grows until it is decided
     optimum_is_proven: bool = True  #: whether the upper bound is proven
-    #: In a partially observable environment, the optimum of agents that see the state; else None.
+    #: In a partially observable environment, the optimum of agents that see the state, and the
+    #: input of the policies whose optimum is the scale: ``observation`` or ``memory``.
     full_optimum: float | None = None
-    #: There, the input of the policies whose optimum is the scale: ``observation`` or ``memory``.
     measured_by: str | None = None
-    #: The optima by agent, if agents play environments with different optima; else empty.
-    optima: Mapping[str, float] = field(default_factory=dict)
+    optima: Mapping[str, float] = field(default_factory=dict)  #: by agent, if they differ
     #: The agents whose mean final return exceeds the upper bound by more than six standard errors.
     impossible: tuple[str, ...] = ()
 
@@ -307,8 +300,7 @@ class StudyAnalysis:
     results: StudyResults  #: the runs
     verdicts: Study  #: the verdicts on all pairs
     environments: tuple[EnvironmentAnalysis, ...]  #: by environment
-    #: Over all environments; None for a single one, or if a score is not known.
-    overall: OverallAnalysis | None
+    overall: OverallAnalysis | None  #: None for one environment, or if a score is not known
 
     @property
     def study(self) -> StudySpec:
@@ -442,4 +434,4 @@ def worst_failed_run(results: StudyResults) -> str | None:
     table = results.summary
     table = table[(table["exact"] == True) & (table["algo"] != "random")]  # noqa: E712  # likewise
     scores = table["score"].astype(float)
-    return str(table.loc[scores.idxmin(), "path"]) if scores.min() < FAILED else None
+    return str(table["path"].iloc[int(scores.argmin())]) if scores.min() < FAILED else None

@@ -52,11 +52,9 @@ class PullStatistics:
     # contexts has one row for all.
     estimates: Annotated[Floats, "seen arms_seen"]
     estimates_std: Annotated[Floats, "seen arms_seen"]  # their standard deviation over runs
-    # Means of the arms, if all runs have the same; else empty.
-    true_means: Annotated[Floats, "known arms_known"]
+    true_means: Annotated[Floats, "known arms_known"]  # if all runs have the same; else empty
     moments: Annotated[Ints, "moments"]  # pulls after which posteriors were stored
-    # Of the first run's arms: parameters of Beta distributions, or means and standard deviations;
-    # else empty.
+    # Of the first run's arms: parameters of Beta distributions, or means and standard deviations.
     posteriors: Annotated[Floats, "kept contexts_kept arms_kept 2"]
 
     def save(self, path: Path) -> None:
@@ -257,14 +255,9 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
     from rl_yardstick.agents.compiled.worlds import NotCompilable
     from rl_yardstick.pipeline.components import constructor_arguments
 
-    arguments: tuple[Any, ...] = (
-        spec.algo,
-        constructor_arguments(spec, load_algorithm(spec.algo), is_dict=False),
-        spec.env_id,
-        spec.env_kwargs,
-        range(spec.seed, spec.seed + n_runs),
-        spec.n_timesteps,
-    )
+    own = constructor_arguments(spec, load_algorithm(spec.algo), is_dict=False)
+    place, seeds = (spec.env_id, spec.env_kwargs), range(spec.seed, spec.seed + n_runs)
+    arguments: tuple[Any, ...] = (spec.algo, own, *place, seeds, spec.n_timesteps)
     try:
         return run_batch(*arguments), "compiled batch"
     except NotCompilable as reason:

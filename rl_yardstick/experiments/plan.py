@@ -67,11 +67,9 @@ class PlannedRun:
     seed: int  #: its seed
     spec: TrainSpec  #: its specification
     path: Path  #: its folder
-    #: Whether it is a batch of all seeds of a bandit agent; ``seed`` is the first.
-    is_batch: bool = False
+    is_batch: bool = False  #: of all seeds of a bandit agent; ``seed`` is the first
     n_runs: int = 1  #: the number of runs in the batch
-    #: Whether some agent here has a memory: then the optimum with memory is the scale of all.
-    on_memory_scale: bool = False
+    on_memory_scale: bool = False  #: whether some agent here has a memory
 
     @property
     def labels(self) -> Labels:
@@ -186,10 +184,8 @@ def _check_folders(what: str, places: Sequence[tuple[str, str]]) -> None:
         # Some file systems ignore case, and the difference of "ä" and "a" with a combining mark.
         key = normalize("NFC", folder.casefold())
         if key in taken:
-            raise UserError(
-                f"{what}: {taken[key]!r} and {label!r} would share the folder {folder}: "
-                "give them labels that differ in letters or digits"
-            )
+            both = f"{what}: {taken[key]!r} and {label!r} would share the folder {folder}"
+            raise UserError(f"{both}: give them labels that differ in letters or digits")
         taken[key] = label
 
 
@@ -285,10 +281,8 @@ class StudyRecord:
 
     def write(self, root: Path) -> None:
         """Write ``study.json``, before the first run."""
-        specs = [
-            {"agent": agent, "environment": environment, "spec": spec.model_dump()}
-            for (agent, environment), spec in self.specs.items()
-        ]
+        items = self.specs.items()
+        specs = [{"agent": a, "environment": e, "spec": s.model_dump()} for (a, e), s in items]
         study = asdict(
             self.study,
             dict_factory=lambda items: {k: str(v) if isinstance(v, Path) else v for k, v in items},

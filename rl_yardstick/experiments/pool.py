@@ -29,7 +29,6 @@ from rl_yardstick.pipeline.run import INTERRUPTED, LOCK, RUNNING, Run, Stop, res
 ERROR_FILE = "error.txt"  # the traceback of a run that failed
 SECONDS_BETWEEN_LINES = 10.0
 GRACE = 30.0  # seconds until stopped runs must have saved their states
-_WINDOWS_OR_MAC = sys.platform in ("win32", "darwin")  # where forked libraries crash
 
 
 def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> None:
@@ -147,7 +146,8 @@ class Workers:
 
 def process_pool(n_workers: int) -> ProcessPool:
     """A pool of processes that have imported the libraries, and use one thread each."""
-    context: Any = multiprocessing.get_context("spawn" if _WINDOWS_OR_MAC else "forkserver")
+    forks = sys.platform not in ("win32", "darwin")  # where forked libraries crash
+    context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
     context.set_forkserver_preload(["rl_yardstick.pipeline.training"])
     for library in ("OMP", "MKL", "OPENBLAS"):  # small networks are slower with more
         os.environ[f"{library}_NUM_THREADS"] = "1"

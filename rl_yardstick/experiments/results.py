@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from rl_yardstick.experiments.bandits import STATISTICS_FILE, PullStatistics, read_pulls, run_regret
-from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.plan import Labels, PlannedRun
 from rl_yardstick.experiments.study import AS_IT_IS, SHIPPED, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.curve_pictures import MEANINGS, read_diagnosis
@@ -191,12 +191,10 @@ class StudyResults:
     summary: pd.DataFrame  #: one row for each finished run, see `RUN_COLUMNS`
     curves: pd.DataFrame  #: learning curves of all runs, see `CURVE_COLUMNS`
     planned: tuple[PlannedRun, ...]  #: all runs of the study, including failed ones
-    #: On bandits, figures by pull, by labels of agent and environment.
-    pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
+    pulls: Mapping[Labels, PullStatistics] = field(default_factory=dict)  #: on bandits
     left_out: tuple[LeftOut, ...] = ()  #: finished runs with files that cannot be read
     finished: tuple[PlannedRun, ...] = ()  #: the runs in the results
-    #: The error messages of runs that have just failed, by folder.
-    failures: Mapping[Path, str] = field(default_factory=dict)
+    failures: Mapping[Path, str] = field(default_factory=dict)  #: why runs have just failed
 
 
 # Further columns, if some environment is partially observable: the optimum of agents that see the
