@@ -256,7 +256,8 @@ def check_settings_kept(job: Job, planned: Sequence[PlannedRun], replaces: bool)
         target = place / run.path.relative_to(job.root / "runs")
         target.parent.mkdir(parents=True, exist_ok=True)
         run.path.rename(target)
-    job.console.print(f"{len(others)} runs are done again: the old folders are in {place} now")
+    runs = "1 run is" if len(others) == 1 else f"{len(others)} runs are"
+    job.console.print(f"{runs} done again: the old folders are in {place} now")
 
 
 def _engines(planned: Sequence[PlannedRun]) -> str:

@@ -371,7 +371,7 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
     held_out = outcome.held_out
     say(console, f"\nsettings on the seeds {held_out.start} to {held_out.stop - 1}:")
     for each in outcome.retested:
-        words = [f"{each.n_runs} runs"]
+        words = ["1 run" if each.n_runs == 1 else f"{each.n_runs} runs"]
         if each.held_out is not None and each.interval is not None:
             ends = f"{each.interval.low:.4g} to {each.interval.high:.4g}"
             words = [f"{each.held_out:.4g} (95 % interval of the mean: {ends})", *words]
