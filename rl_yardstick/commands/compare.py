@@ -160,7 +160,7 @@ def main() -> int:
     job.console.print(record.study.title, style="bold")
     with held(root), workers:
         if args.until_decided:
-            from rl_yardstick.experiments.growing import plan_of_looks
+            from rl_yardstick.experiments.plan import plan_of_looks
 
             looks = plan_of_looks(record.study, root, args.max_seeds)
             record = replace(record, looks=looks)
@@ -213,12 +213,10 @@ def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> W
 
 def carry_out(job: Job, record: StudyRecord, replaces: bool = False) -> int:
     """Do a study, and judge it; return 0 if all runs are finished, else 1."""
-    from rl_yardstick.experiments.growing import first_counts
     from rl_yardstick.experiments.plan import plan
 
     study, looks = record.study, record.looks
-    counts = first_counts(study) if looks else None
-    planned = plan(study, job.root, counts, record.specs)
+    planned = plan(study, job.root, specs=record.specs)
     check_settings_kept(job, planned, replaces)
     record.write(job.root)
     if engines := _engines(planned):
@@ -258,12 +256,13 @@ def check_settings_kept(job: Job, planned: Sequence[PlannedRun], replaces: bool)
         target = place / run.path.relative_to(job.root / "runs")
         target.parent.mkdir(parents=True, exist_ok=True)
         run.path.rename(target)
-    job.console.print(f"{len(others)} runs are done again: the old folders are in {place} now")
+    runs = "1 run is" if len(others) == 1 else f"{len(others)} runs are"
+    job.console.print(f"{runs} done again: the old folders are in {place} now")
 
 
 def _engines(planned: Sequence[PlannedRun]) -> str:
     """The engines of the missing runs of networks, in words."""
-    from rl_yardstick.experiments.plan import NETWORKS
+    from rl_yardstick.commands.engines import NETWORKS, planned_outlook, study_line
 
     missing: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in planned:
@@ -271,8 +270,6 @@ def _engines(planned: Sequence[PlannedRun]) -> str:
             missing.setdefault(run.labels, []).append(run)
     if not missing:  # without the libraries
         return ""
-    from rl_yardstick.commands.engines import planned_outlook, study_line
-
     found = [(labels[0], planned_outlook(r[0].spec), len(r)) for labels, r in missing.items()]
     return study_line([(label, each, n) for label, each, n in found if each is not None])
 
@@ -287,9 +284,9 @@ def do_study(
     failures: dict[Path, str] = known.setdefault("failures", {})
     to_do = [run for run in planned if run.path not in failures and not run.is_finished]
     n_done = len(planned) - len(to_do)
-    job.console.print(
-        f"{len(planned)} runs, {n_done} of them there already; {job.workers.words}, in {job.root}"
-    )
+    runs = "1 run" if len(planned) == 1 else f"{len(planned)} runs"
+    there = f"{n_done} of them there already"
+    job.console.print(f"{runs}, {there}; {job.workers.words}, in {job.root}")
     try:
         failures |= do_runs(to_do, job.workers, job.command, job.console, job.stop)
     finally:
@@ -310,12 +307,13 @@ def look_by_look(
 
     It begins with the first look: finished runs may already be enough.
     """
-    from rl_yardstick.experiments.growing import first_counts, grown, looked, next_counts
+    from rl_yardstick.experiments.analysis import looked
     from rl_yardstick.experiments.plan import plan
 
-    counts, n_said, known = first_counts(record.study), 0, dict[Any, Any]()
+    counts = dict.fromkeys(record.specs, record.study.n_seeds)
+    n_said, known = 0, dict[Any, Any]()
     while True:
-        study = grown(record.study, counts)
+        study = replace(record.study, n_seeds=max(counts.values()))
         planned = plan(study, job.root, counts, record.specs)
         results = do_study(job, study, planned, known)
         said = looked(results, record.looks)
@@ -325,7 +323,7 @@ def look_by_look(
             job.console.print(_on_look(said, record.looks))
         if is_over:
             return results, said
-        counts = {**counts, **next_counts(said)}
+        counts |= {(agent, e): n for e, by in said.seeds.items() for agent, n in by.items()}
 
 
 def _on_look(said: Study, looks: Sequence[int]) -> str:
@@ -361,16 +359,18 @@ def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
 
 def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
     """Print the judgement, and write tables, figures and page."""
-    from rl_yardstick.experiments.analysis import analyse, with_advice
+    from rl_yardstick.experiments.analysis import analyse, worst_failed_run
 
     console, width = job.console, results.study.episodes_table
     with console.status("judging the agents"):
-        analysis = with_advice(analyse(results, looks))
+        analysis = analyse(results, looks)
     job.stop.check()
     from rl_yardstick.report.documents import write_tables, write_verdicts
     from rl_yardstick.report.terminal import print_analysis, print_episodes_table
 
     print_analysis(console, analysis)
+    if failed := worst_failed_run(results):
+        console.print(f"why the worst run failed: {called_as('explain')} {failed}")
     with console.status("writing the tables"):
         files = [*write_tables(results), *write_verdicts(analysis, job.command)]
     blocks = None

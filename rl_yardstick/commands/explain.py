@@ -191,12 +191,12 @@ def tried_changes(
 ) -> list[Any]:
     """Train four seeds as shipped, as it is and with each change; return the returns as JSON."""
     from rl_yardstick.commands.compare import Job, do_study, held
-    from rl_yardstick.commands.engines import about
     from rl_yardstick.commands.terminal import say
-    from rl_yardstick.experiments.interventions import intervention_study, relative_length, tried
     from rl_yardstick.experiments.plan import StudyRecord, plan, specs_of
     from rl_yardstick.experiments.pool import Workers, available_cores
-    from rl_yardstick.pipeline.run import Run, Stop
+    from rl_yardstick.experiments.results import tried
+    from rl_yardstick.experiments.study import intervention_study
+    from rl_yardstick.pipeline.run import Stop
     from rl_yardstick.report.why import tried_lines
 
     spec, run = one.found.spec, one.found.run
@@ -206,12 +206,6 @@ def tried_changes(
     root, specs = Path(args.folder) / "explain" / study.name, specs_of(study)
     planned = plan(study, root, specs=specs)
     n_workers = max(args.jobs, 0) or available_cores()
-    to_do = [one for one in planned if not one.is_finished]
-    seconds = None if run is None else Run(run).recorded().get("cpu_seconds")
-    if to_do and seconds is not None:
-        length = relative_length(to_do, spec, one.agent.num_timesteps)
-        time = about(seconds * length / min(n_workers, len(to_do)))
-        say(console, f"{len(to_do)} runs, {time} at the pace of this run")
     with held(root), Workers(n_workers, None) as workers:
         StudyRecord(study, specs).write(root)
         job = Job(root, command_line(), console, Stop().listen(), workers)

@@ -38,15 +38,14 @@ from rl_yardstick.commands.compare import (
 )
 from rl_yardstick.commands.terminal import say, table_console
 from rl_yardstick.pipeline.errors import Stopped, UserError
-from rl_yardstick.tuning.pruning import PRUNERS
 from rl_yardstick.tuning.tuning_spec import (
     AUTO,
     FIGURES,
     OBJECTIVES,
+    PRUNERS,
     SAMPLERS,
     SHIPPED,
     TuningSpec,
-    without_secret,
 )
 
 if TYPE_CHECKING:
@@ -65,7 +64,6 @@ examples:
   python tune.py --env Warehouse-v0 --algo ppo --trials 100
   python tune.py --env FrozenLake8x8-v1 --algo ppo --engine auto -j 4
   python tune.py --env CartPole-v1 --algo dqn --seeds-per-trial 10 --objective lower
-  python tune.py --env Taxi-v4 --algo qlearning --sampler grid
 
 The same command again continues the search.
 """
@@ -98,8 +96,6 @@ def build_parser() -> argparse.ArgumentParser:
     add_shared(group, "--jobs", "--cluster", "--run-timeout")
 
     add = parser.add_argument_group("output").add_argument
-    storage = "database of the trials: sqlite:///FILE, postgresql://... (default: in the folder)"
-    add("--storage", type=filled, metavar="WHERE", help=storage)
     name = "name of the search and its folder (default: ENV_AGENT)"
     add("--name", "--study-name", type=folder_name, help=name)
     names = ("-f", "--log-folder", "--optimization-log-path")
@@ -122,12 +118,12 @@ def _add_search(add: Callable[..., Any]) -> None:
     add("--objective", choices=OBJECTIVES, default="mean", help=statistic)
     figure = "which figure of a run counts (default: score, the final policy's return between the "
     figure += "best random or constant policy, 0, and the optimum, 1; the return if no optimum is "
-    figure += "known; on bandits regret); steps and seconds count until the threshold"
+    figure += "known; on bandits regret); steps: those until the threshold"
     add("--metric", choices=FIGURES, help=figure)
     add("--threshold", type=float, metavar="RETURN", help="the return that counts as solved")
     add("--sampler", choices=SAMPLERS, default="tpe", help="what suggests settings (tpe)")
-    pruned = "rule that ends hopeless trials (auto)"
-    add("--pruner", choices=tuple(PRUNERS), default="auto", help=pruned)
+    pruned = "whether hopeless trials end early (auto: they do)"
+    add("--pruner", choices=PRUNERS, default="auto", help=pruned)
     drawn, count = "random trials before the sampler learns (10)", whole_number(0, 100_000)
     add("--n-startup-trials", type=count, default=10, metavar="N", help=drawn)
     space = "the values to choose from (default: hyperparams/search_spaces/AGENT.yml)"
@@ -208,14 +204,12 @@ def main() -> int:
     tuning = tuning_spec(args)
     root = Path(args.log_folder) / tuning.study.name
     workers = workers_of(args, root, tuning.study.run_timeout)
-    # Run folders record the command, so it must not contain a password.
-    command = without_secret(command_line())
-    job = Job(root, command, table_console(), stop, workers, not args.no_report)
+    job = Job(root, command_line(), table_console(), stop, workers, not args.no_report)
     job.console.print(tuning.study.title, style="bold")
     with job.console.status("loading the libraries"):
         from rl_yardstick.tuning.searching import open_search, storage_errors
-    with held(root), workers, storage_errors(without_secret(args.storage or f"{root}/trials.db")):
-        search = open_search(tuning, root, args.storage)
+    with held(root), workers, storage_errors(root):
+        search = open_search(tuning, root)
         search.deadline = deadline
         print_opened(job, search)
         try:
@@ -281,8 +275,7 @@ def retested(
 ) -> tuple[int, Outcome]:
     """Do the re-test; return the exit code and the outcome."""
     from rl_yardstick.experiments.analysis import analyse
-    from rl_yardstick.experiments.growing import plan_of_looks
-    from rl_yardstick.experiments.plan import StudyRecord, plan, specs_of
+    from rl_yardstick.experiments.plan import StudyRecord, plan, plan_of_looks, specs_of
     from rl_yardstick.tuning.retesting import FOLDER, concluded, is_settled, retest_study
 
     tuning, again = search.tuning, replace(job, root=job.root / FOLDER)
@@ -333,8 +326,6 @@ def print_opened(job: Job, search: Search) -> None:
     lines = [f"{there} already; {free}"]
     if mark := unproven_mark(tuning):
         lines.append(f"scores are{mark}")
-    if suggestions.fits_batches:
-        lines.append("batch_size: the nearest number that divides n_steps times n_envs is tried")
     wider = "the search space is widened to hold the shipped value"
     lines += [f"{name}: {wider}" for name in suggestions.space.widened]
     if algo in NETWORKS:
@@ -380,7 +371,7 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
     held_out = outcome.held_out
     say(console, f"\nsettings on the seeds {held_out.start} to {held_out.stop - 1}:")
     for each in outcome.retested:
-        words = [f"{each.n_runs} runs"]
+        words = ["1 run" if each.n_runs == 1 else f"{each.n_runs} runs"]
         if each.held_out is not None and each.interval is not None:
             ends = f"{each.interval.low:.4g} to {each.interval.high:.4g}"
             words = [f"{each.held_out:.4g} (95 % interval of the mean: {ends})", *words]

@@ -14,7 +14,7 @@ may be negative.
 6. Look-ahead: the agent itself.
 
 A part says where the return is lost, not why. `diagnosis.proposals` says what may help, and
-`experiments.interventions` tries it.
+`experiments.study.intervention_study` tries it.
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
 """Analyses the runs of a study: figures with intervals, verdicts on pairs, failed runs.
 
-It also says how soon agents reach the threshold, and what the agents of failed runs do instead of
-their task.
+It also says how soon agents reach the threshold.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing, suppress
-from dataclasses import dataclass, field, fields, replace
+from contextlib import closing
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
@@ -16,14 +15,10 @@ import pandas as pd
 
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs.brackets import return_bounds
-from rl_yardstick.experiments.plan import PlannedRun
-from rl_yardstick.experiments.pool import do_aside
 from rl_yardstick.experiments.results import StudyResults, values_over_seeds
 from rl_yardstick.experiments.study import COSTS, OF_TRAINING, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
-from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import FAILED, Yardstick
 from rl_yardstick.verdicts import (
     UNBOUNDED,
@@ -43,9 +38,7 @@ from rl_yardstick.verdicts import (
 )
 
 ON_THE_SCALE = ("final", "best")  # metrics on the scale of the best random or constant policy
-# Prefixes of the entry points of agents that do not learn.
-FIXED_POLICIES = ("rl_yardstick.agents.planning:", "rl_yardstick.agents.reference:")
-
+FIXED_POLICIES = ("planning", "reference")  # families of agents that do not learn
 UNIT: Bounds = (0.0, 1.0)  # of scores
 MARGIN = 0.02  # of the gap between the best random or constant policy and the optimum
 OVERALL = "all environments"  # the name of the comparison of scores over all environments
@@ -62,10 +55,8 @@ class Evidence:
     #: By agent, the metric of its seeds, shape (n_seeds,): NaN for a missing run.
     values: Mapping[str, Floats] = field(default_factory=dict)
     seeds: Mapping[str, int] = field(default_factory=dict)  #: by agent, its planned seeds
-    #: The highest expected return of any policy, or an upper bound of it; None if unknown.
-    optimum: float | None
-    #: A lower bound of the optimum; None if ``optimum`` is exact or unknown.
-    optimum_at_least: float | None = None
+    optimum: float | None  #: the highest expected return of any policy, or an upper bound of it
+    optimum_at_least: float | None = None  #: a lower bound, if ``optimum`` is an upper one
     baseline: float | None  #: expected return of the best random or constant policy, or None
     threshold: float | None  #: the return that counts as solved, or None
     bounds: Bounds  #: the least and the greatest possible return
@@ -87,53 +78,46 @@ class Evidence:
         return {name: np.clip((x - zero) / (one - zero), 0, 1) for name, x in given.items()}
 
     @property
-    def score_bounds(self) -> Bounds:
-        """The least and the greatest possible of these scores."""
-        if self.is_score:
-            return UNIT
-        return (-self.bounds[1], -self.bounds[0]) if self.is_cost else self.bounds
+    def judged_bounds(self) -> Bounds:
+        """The least and the greatest possible score, or else metric."""
+        return UNIT if self.is_score else self.bounds
 
 
-def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
-    """Collect the evidence on an environment; None if no run has finished."""
+def evidence_of(results: StudyResults) -> list[Evidence]:
+    """Collect the evidence on each environment on which a run has finished."""
+    there = set(results.summary["environment"])
+    return [_evidence_on(results, e.label) for e in results.study.environments if e.label in there]
+
+
+def _evidence_on(results: StudyResults, environment: str) -> Evidence:
     study, table = results.study, results.summary
     table = table[table["environment"] == environment]
-    if table.empty:
-        return None
     optimum, baseline = _first(table, "optimum"), _first(table, "baseline")
-    at_least = _first(table, "optimum_at_least")
-    is_score, span = False, 0.0
+    is_score, margin = False, study.margin or 0.0
     if study.metric in ON_THE_SCALE and optimum is not None and baseline is not None:
         is_score = Yardstick(optimum, baseline).has_scale
-        span = optimum - baseline
-    margin = 0.0 if study.margin is None else study.margin
-    if is_score:
-        margin = MARGIN if study.margin is None else study.margin / span
+        if is_score:
+            margin = MARGIN if study.margin is None else study.margin / (optimum - baseline)
+    # Agents that do not learn are certain if policies are evaluated exactly.
+    is_exact = (table["exact"] == True).all()  # noqa: E712  # None is neither True nor False
+    fixed = [a.label for a in study.agents if ALGORITHMS[a.algo].family in FIXED_POLICIES]
+    seeds = dict.fromkeys((agent.label for agent in study.agents), 0)
+    for run in results.planned:
+        if run.environment == environment:
+            seeds[run.agent] += run.n_runs
     return Evidence(
         environment=environment,
         values=values_over_seeds(results, environment, study.metric),
-        seeds=_seeds(results, environment),
+        seeds=seeds,
         optimum=optimum,
-        optimum_at_least=at_least,
+        optimum_at_least=_first(table, "optimum_at_least"),
         baseline=baseline,
         threshold=_first(table, "threshold"),
         bounds=_bounds(results, environment, optimum),
-        certain=agents_without_chance(results, table),
+        certain=frozenset(fixed if is_exact else ()),
         is_score=is_score,
         is_cost=study.metric in COSTS,
         margin=margin,
-    )
-
-
-def agents_without_chance(results: StudyResults, table: pd.DataFrame) -> frozenset[str]:
-    """The agents that do not learn, if policies are evaluated exactly: all their runs are equal."""
-    if not (table["exact"] == True).all():  # noqa: E712  # None is neither True nor False
-        return frozenset()
-    return frozenset(
-        agent.label
-        for agent in results.study.agents
-        if agent.algo in ALGORITHMS
-        and ALGORITHMS[agent.algo].entry_point.startswith(FIXED_POLICIES)
     )
 
 
@@ -150,35 +134,23 @@ def _bounds(results: StudyResults, environment: str, optimum: float | None) -> B
     return low, high if optimum is None or study.metric in OF_TRAINING else min(high, optimum)
 
 
-def _seeds(results: StudyResults, environment: str) -> dict[str, int]:
-    counts = dict.fromkeys((agent.label for agent in results.study.agents), 0)
-    for run in results.planned:
-        if run.environment == environment:
-            counts[run.agent] += run.n_runs
-    return counts
-
-
 def _first(table: pd.DataFrame, column: str) -> float | None:
     known = table[column].dropna()
     return None if known.empty else float(known.iloc[0])
 
 
-def verdicts_on(
+def _verdicts_on(
     study: StudySpec,
     evidence: Sequence[Evidence],
-    looks: Sequence[int] = (),
+    looks: Sequence[int],
     overall: Mapping[str, Floats] | None = None,
 ) -> Study:
-    """The verdicts on all pairs of a study.
-
-    Args:
-        study: the study.
-        evidence: of each environment with runs.
-        looks: the seeds at each look of a study that grows until it is decided.
-        overall: by agent, its mean score over all environments for each seed, shape (n_seeds,).
-    """
+    """The verdicts on all pairs; ``overall`` has mean scores over all environments by seed."""
     scores: dict[str, Mapping[str, Floats]] = {one.environment: one.scores for one in evidence}
-    bounds = {one.environment: one.score_bounds for one in evidence}
+    bounds = {one.environment: one.judged_bounds for one in evidence}
+    for one in evidence:
+        if one.is_cost:
+            bounds[one.environment] = (-one.bounds[1], -one.bounds[0])
     margin = {one.environment: one.margin for one in evidence}
     baseline = {one.environment: 0.0 if one.is_score else None for one in evidence}
     if overall is not None:
@@ -196,6 +168,14 @@ def verdicts_on(
     )
 
 
+def looked(results: StudyResults, looks: Sequence[int]) -> Study:
+    """The verdicts of a growing study after all looks that its runs allow.
+
+    All looks are computed from the scores, however often somebody ran the command.
+    """
+    return _verdicts_on(results.study, evidence_of(results), looks)
+
+
 # --- all environments together --------------------------------------------------------------------
 
 
@@ -204,12 +184,10 @@ class OverallAnalysis:
     """The comparison of agents over all environments, by their scores."""
 
     scores: Mapping[str, Summary]  #: figures by agent, the best first
-    #: All pairs, better ranked agent first, by the means of their scores over environments; none
-    #: in a study that grows until it is decided.
-    pairs: tuple[Pair, ...]
-    best: Best | None  #: likewise None
+    pairs: tuple[Pair, ...]  #: better ranked agent first; none in a growing study
+    best: Best | None  #: None in a growing study
     thresholds: Floats  #: the scores of the profiles, shape (n,)
-    profiles: Mapping[str, Floats]  #: by agent, the share of runs above each of these scores
+    profiles: Mapping[str, Floats]  #: by agent, the share of runs above each of these
 
 
 def scores_over_all(results: StudyResults) -> dict[str, Floats] | None:
@@ -256,39 +234,36 @@ class AgentAnalysis:
     """The results of one agent on one environment."""
 
     agent: str  #: its label
-    algo: str  #: its name in the table of agents
     runs: AgentRuns  #: its runs as the verdicts compare them
     judged: Estimate  #: the mean of what the verdicts compare: scores, or else the metric
     spread: float  #: the standard deviation of these over runs
     n_runs: int  #: finished runs
     n_missing: int  #: unfinished runs
     metric: Summary  #: the metric of the verdicts, over seeds
-    #: The final policy's score: 0 is the best random or constant policy, 1 the optimum; less
-    #: counts as 0. None if these are not known.
+    #: The final policy's score, cut at 0 and 1; None if its scale is not known.
     score: Estimate | None
     final: Estimate  #: mean return of the final policy
-    area: Estimate  #: mean return over the learning curve
     last_episodes: Estimate  #: mean return of the last training episodes
     regret: Estimate  #: on bandits, the sum over all pulls; else NaN
-    #: Steps until the learning curve first reached the threshold; None without a threshold.
+    #: Steps until the learning curve first reached the threshold, steps and episodes until it
+    #: reached the threshold for good; None without a threshold.
     steps_to_threshold: ThresholdSummary | None
-    episodes_to_stay: ThresholdSummary | None  #: episodes until it reached the threshold for good
+    steps_to_stay: ThresholdSummary | None
+    episodes_to_stay: ThresholdSummary | None
     success_rate: Estimate | None  #: of the final policy; None if not reported
     seconds: Estimate  #: processor time of training
-    #: Whether it was trained on a variant of the environment, whose returns cannot be compared
-    #: with those of evaluations or the optimum.
-    on_variant: bool = False
-    #: Training's changes of the environment in words, as the runs recorded them.
-    changes: tuple[str, ...] = ()
-    #: Steps until the learning curve reached the threshold for good; None without a threshold.
-    steps_to_stay: ThresholdSummary | None = None
-    #: Exact return of the policy that acts in training, None if unknown, and its description.
-    stochastic: Estimate | None = None
-    acts_by: str = ""
+    changes: tuple[str, ...] = ()  #: of the environment in training, in words
+    stochastic: Estimate | None = None  #: exact return of the policy that acts in training
+    acts_by: str = ""  #: this policy in words
     #: Exact discounted return of the final policy, the agent's discount, and the optimum under it.
     discounted: Estimate | None = None
     discount: float | None = None
     discounted_optimum: float | None = None
+
+    @property
+    def on_variant(self) -> bool:
+        """Whether its training returns are of a changed environment, and cannot be compared."""
+        return bool(self.changes)
 
     @property
     def marked(self) -> str:
@@ -306,17 +281,14 @@ class EnvironmentAnalysis(Evidence):
     pairs: tuple[Pair, ...]  #: all pairs, better ranked agent first
     best: Best  #: the agents than which no other is shown to be better
     failure_threshold: float | None  #: the score below which a run failed; None if not defined
-    #: Missing runs by agent, including agents without a finished run.
-    missing: Mapping[str, int] = field(default_factory=dict)
+    missing: Mapping[str, int] = field(default_factory=dict)  #: runs, also by agents without one
     looks: tuple[int, ...] = ()  #: the seeds at each look, if the study grows until it is decided
     optimum_is_proven: bool = True  #: whether the upper bound is proven
-    #: In a partially observable environment, the optimum of agents that see the state; else None.
+    #: In a partially observable environment, the optimum of agents that see the state, and the
+    #: input of the policies whose optimum is the scale: ``observation`` or ``memory``.
     full_optimum: float | None = None
-    #: There, the input of the policies whose optimum is the scale: ``observation`` or ``memory``.
     measured_by: str | None = None
-    #: The optima by agent, if agents play environments with different optima; else empty.
-    optima: Mapping[str, float] = field(default_factory=dict)
-    advice: tuple[str, ...] = ()  #: sentences on failed runs, see `with_advice`
+    optima: Mapping[str, float] = field(default_factory=dict)  #: by agent, if they differ
     #: The agents whose mean final return exceeds the upper bound by more than six standard errors.
     impossible: tuple[str, ...] = ()
 
@@ -328,8 +300,7 @@ class StudyAnalysis:
     results: StudyResults  #: the runs
     verdicts: Study  #: the verdicts on all pairs
     environments: tuple[EnvironmentAnalysis, ...]  #: by environment
-    #: Over all environments; None for a single one, or if a score is not known.
-    overall: OverallAnalysis | None
+    overall: OverallAnalysis | None  #: None for one environment, or if a score is not known
 
     @property
     def study(self) -> StudySpec:
@@ -338,20 +309,13 @@ class StudyAnalysis:
 
 
 def analyse(results: StudyResults, looks: Sequence[int] = ()) -> StudyAnalysis:
-    """Analyse the runs of a study.
-
-    Args:
-        results: the runs.
-        looks: the seeds at each look, if the study grows until its pairs are decided.
-    """
-    found = [evidence_on(results, environment.label) for environment in results.study.environments]
-    evidence = [one for one in found if one is not None]
+    """Analyse the runs of a study; ``looks`` are the seeds at each look, if it grows."""
+    evidence = evidence_of(results)
     scores = scores_over_all(results)
     means = {name: matrix.mean(axis=1) for name, matrix in scores.items()} if scores else None
-    said = verdicts_on(results.study, evidence, looks, None if looks else means)
-    environments = [_analyse_environment(results, one, said, looks) for one in evidence]
-    overall = _overall(scores, said) if scores else None
-    return StudyAnalysis(results, said, tuple(environments), overall)
+    said = _verdicts_on(results.study, evidence, looks, None if looks else means)
+    environments = tuple(_analyse_environment(results, one, said, looks) for one in evidence)
+    return StudyAnalysis(results, said, environments, _overall(scores, said) if scores else None)
 
 
 def _analyse_environment(
@@ -427,19 +391,14 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
 
     compared = evidence.scores[agent]
     finite = compared[np.isfinite(compared)]
-    sign = -1.0 if evidence.is_cost else 1.0
-    low, high = evidence.score_bounds if evidence.is_score else evidence.bounds
-    judged = mean_over_runs(compared if evidence.is_score else sign * compared, (low, high))
-    optimum, baseline = evidence.optimum, evidence.baseline
-    score = None
+    judged = mean_over_runs(-compared if evidence.is_cost else compared, evidence.judged_bounds)
+    optimum, baseline, score = evidence.optimum, evidence.baseline, None
     if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
         score = mean_over_runs(np.clip(values("score"), 0, 1), UNIT)
     of_returns = evidence.bounds if study.metric in ON_THE_SCALE else UNBOUNDED
     first = next(run for run in results.planned if run.labels == (agent, environment))
-    changes = training_changes(first.spec)
     return AgentAnalysis(
         agent=agent,
-        algo=next(spec.algo for spec in study.agents if spec.label == agent),
         runs=runs,
         judged=judged,
         spread=float(finite.std(ddof=1)) if len(finite) > 1 else 0.0,
@@ -448,7 +407,6 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         metric=summarise(values(study.metric), evidence.bounds),
         score=score,
         final=mean("final", of_returns),
-        area=mean("area", of_returns),
         last_episodes=mean("last_episodes"),
         regret=mean("regret", (0.0, np.inf)),
         steps_to_threshold=steps("steps_to_threshold"),
@@ -456,8 +414,7 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         episodes_to_stay=steps("episodes_to_stay"),
         success_rate=known("success_rate", UNIT),
         seconds=mean("cpu_seconds", (0.0, np.inf)),
-        on_variant=bool(changes),
-        changes=changes,
+        changes=training_changes(first.spec),
         stochastic=known("stochastic_return"),
         acts_by=_only(table["acts_by"]),
         discounted=known("discounted_return"),
@@ -472,73 +429,9 @@ def _only(texts: pd.Series) -> str:
     return str(found[0]) if len(found) == 1 else ""
 
 
-# --- advice on failed runs, once for each agent ---------------------------------------------------
-
-# The largest number of agents per environment with advice, because each agent is loaded.
-MOST_TOLD = 4
-
-
-def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
-    """The analysis with sentences on failed runs, if there is advice."""
-    thresholds = analysis.verdicts.failure_threshold
-    failed = [
-        _failed_runs(analysis.results, one.environment, thresholds[one.environment])
-        for one in analysis.environments
-    ]
-    asked = [runs[0] for several in failed for runs, _ in several[:MOST_TOLD]]
-    answers = iter(do_aside(advice_on, asked) if asked else ())
-    environments = []
-    for one, several in zip(analysis.environments, failed, strict=True):
-        advice = []
-        for runs, n_runs in several[:MOST_TOLD]:
-            first, answer = runs[0], next(answers)
-            if answer is not None:
-                of = f"{len(runs)} of {n_runs} runs" if n_runs > 1 else "its run"
-                seed = f"; seed {first.seed}" if len(runs) > 1 else ""
-                instead, try_first = answer
-                then = f"; try first: {try_first}" if try_first else ""
-                told = f"{first.agent} failed in {of}{seed}"
-                advice.append(f"{told}: {instead}{then}.")
-        if more := several[MOST_TOLD:]:
-            names = ", ".join(f"{runs[0].agent} ({len(runs)} of {n})" for runs, n in more)
-            advice.append(f"Runs of {len(more)} more agents failed: {names}.")
-        environments.append(replace(one, advice=tuple(advice)))
-    return replace(analysis, environments=tuple(environments))
-
-
-def _failed_runs(
-    results: StudyResults, label: str, threshold: float
-) -> list[tuple[list[PlannedRun], int]]:
-    """For each agent with failed runs: these runs by seed, and its number of runs.
-
-    Where no agent has learnt, so that the threshold is NaN, all runs at the baseline count.
-    """
-    table = results.summary[results.summary["environment"] == label]
-    runs = {(run.agent, run.seed): run for run in results.finished if run.environment == label}
-    least = FAILED if np.isnan(threshold) else threshold
-    found = []
-    for agent, rows in table.groupby("agent", sort=False):
-        has_failed = rows["score"].astype(float) < least
-        seeds = rows[has_failed & rows["exact"].astype(bool)]["seed"]
-        if len(seeds):
-            found.append(([runs[str(agent), int(seed)] for seed in sorted(seeds)], len(rows)))
-    return found
-
-
-def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]:
-    """The advice on the agent of each run; None for a run without advice."""
-    from rl_yardstick.pipeline.evaluation.advice import advice
-    from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
-    from rl_yardstick.pipeline.models import load_agent, model_of_run
-
-    answers: list[tuple[str, str | None] | None] = []
-    for planned in runs:
-        found, spec = None, planned.spec
-        with suppress(UserError, OSError):
-            import_modules(spec.gym_packages)
-            evaluator, agent = exact_evaluator(spec), load_agent(model_of_run(planned.run))
-            if evaluator is not None and not evaluator.obstacle(agent):
-                n_steps = int(planned.recorded()["n_timesteps"])
-                found = advice(spec, agent, evaluator, evaluator(agent), n_steps)
-        answers.append(None if found is None else (found.instead, found.try_first))
-    return answers
+def worst_failed_run(results: StudyResults) -> str | None:
+    """The folder of the run with the lowest exact score, if it has failed; random agents apart."""
+    table = results.summary
+    table = table[(table["exact"] == True) & (table["algo"] != "random")]  # noqa: E712  # likewise
+    scores = table["score"].astype(float)
+    return str(table["path"].iloc[int(scores.argmin())]) if scores.min() < FAILED else None

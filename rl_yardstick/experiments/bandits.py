@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,24 +48,19 @@ class PullStatistics:
     total_reward: Annotated[Floats, "runs"]
     total_regret: Annotated[Floats, "runs"]
     shares: Annotated[Floats, "contexts arms"]  # share of each arm among the pulls, by context
-    # Mean regret of a pull; nan if the arm was never pulled.
-    context_regret: Annotated[Floats, "contexts arms"]
     # Mean of the final estimates over runs; empty if the agent has no estimates. An agent without
     # contexts has one row for all.
     estimates: Annotated[Floats, "seen arms_seen"]
     estimates_std: Annotated[Floats, "seen arms_seen"]  # their standard deviation over runs
-    # Means of the arms, if all runs have the same; else empty.
-    true_means: Annotated[Floats, "known arms_known"]
+    true_means: Annotated[Floats, "known arms_known"]  # if all runs have the same; else empty
     moments: Annotated[Ints, "moments"]  # pulls after which posteriors were stored
-    # Of the first run's arms: parameters of Beta distributions, or means and standard deviations;
-    # else empty.
+    # Of the first run's arms: parameters of Beta distributions, or means and standard deviations.
     posteriors: Annotated[Floats, "kept contexts_kept arms_kept 2"]
 
     def save(self, path: Path) -> None:
         """Write all arrays to a NumPy archive."""
-        arrays: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         with replacing(path) as beside:
-            np.savez(beside, allow_pickle=False, **arrays)
+            np.savez(beside, allow_pickle=False, **vars(self))
 
     @classmethod
     def load(cls, path: Path) -> PullStatistics:
@@ -110,13 +105,13 @@ def pull_statistics(
     cells = arms.astype(np.int64) + n_arms * (0 if contexts is None else contexts.astype(np.int64))
     size = n_arms * n_contexts
     counts = np.bincount(cells.ravel(), minlength=size).reshape(n_contexts, n_arms)
-    sums = np.bincount(cells.ravel(), weights=regrets.ravel(), minlength=size)
-    empty = np.empty((0, 0))
     with np.errstate(invalid="ignore"):
-        context_regret = sums.reshape(n_contexts, n_arms) / counts
         shares = counts / counts.sum(axis=1, keepdims=True)
-    n_runs = len(arms)
-    mean, std = _mean_and_std(empty[None] if estimates is None else estimates)
+    n_runs, empty = len(arms), np.empty((0, 0))
+    estimates = empty[None] if estimates is None else estimates
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
+        # Without nan; nan if no run has a figure.
+        mean, std = np.nanmean(estimates, axis=0), np.nanstd(estimates, axis=0)
     return PullStatistics(
         pulls=points,
         reward=_mean_since_last(rewards.mean(axis=0, dtype=np.float64), points),
@@ -129,23 +124,12 @@ def pull_statistics(
         total_reward=rewards.sum(axis=1, dtype=np.float64),
         total_regret=cumulative[:, -1],
         shares=shares,
-        context_regret=context_regret,
         estimates=mean,
         estimates_std=std,
         true_means=empty if true_means is None else true_means,
         moments=np.array(moments, dtype=np.int64),
         posteriors=np.empty((0, 0, 0, 2)) if posteriors is None else posteriors[0],
     )
-
-
-def _mean_and_std(estimates: Floats) -> tuple[Floats, Floats]:
-    """Mean and deviation over runs, without nan; nan if no run has a figure."""
-    is_known = ~np.isnan(estimates)
-    with np.errstate(invalid="ignore"):
-        n_known = is_known.sum(axis=0)
-        mean = np.where(is_known, estimates, 0.0).sum(axis=0) / n_known
-        squares = np.where(is_known, estimates - mean, 0.0) ** 2
-        return mean, np.sqrt(squares.sum(axis=0) / n_known)
 
 
 def _mean_since_last(by_pull: Floats, points: Ints) -> Floats:
@@ -230,25 +214,15 @@ def _statistics_on(
     with closing(make_single_env(spec)) as env:
         bandit: Any = env.unwrapped
         n_arms, n_contexts = bandit.n_arms, max(bandit.n_contexts, 1)
-        is_known = bandit.n_contexts > 0 and not _is_drifting(bandit)
-        more["true_means"] = true_means(env)
+        drifts, means = getattr(bandit, "drift_std", 0.0) > 0, getattr(bandit, "means", None)
+        if means is not None and not drifts and not getattr(bandit, "redraws", False):
+            more["true_means"] = np.array(means, dtype=np.float64)
+        is_known = bandit.n_contexts > 0 and not drifts
     contexts = contexts if n_contexts > 1 else None
     found = pull_statistics(arms, rewards, regrets, contexts, n_arms, n_contexts, **more)
     # Simple regret is not defined if the means drift, or depend on a vector.
     nowhere = np.full_like(found.simple_regret, np.nan)
     return found if is_known else replace(found, simple_regret=nowhere)
-
-
-def true_means(env: gym.Env[Any, Any]) -> Floats | None:
-    """Means of the arms by context, shape (n_contexts, n_arms), if all runs have the same."""
-    bandit: Any = env.unwrapped
-    moves = getattr(bandit, "redraws", False) or _is_drifting(bandit)
-    means = getattr(bandit, "means", None)
-    return None if moves or means is None else np.array(means, dtype=np.float64)
-
-
-def _is_drifting(bandit: Any) -> bool:
-    return bool(getattr(bandit, "drift_std", 0.0) > 0)
 
 
 # --- all runs of an agent as one batch: each a fresh agent and one episode ------------------------
@@ -262,18 +236,13 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run) -> None:
     started = WorkTime.now()
     with compile_timer() as time_compiling:
         result, engine = _run(spec, n_runs)
-    _check_rewards(result, spec.seed)
-    statistics = _statistics_on(
-        spec,
-        result.arms,
-        result.rewards,
-        result.regrets,
-        result.contexts,
-        estimates=result.estimates,
-        moments=result.moments,
-        posteriors=result.posteriors,
-    )
-    statistics.save(run.path / STATISTICS_FILE)
+    for seed, rewards in enumerate(result.rewards, start=spec.seed):
+        if not np.isfinite(rewards).all():
+            pull = int(np.argmin(np.isfinite(rewards)))
+            raise UserError(f"reward of seed {seed} at step {pull + 1:,} is {rewards[pull]}")
+    pulls = result.arms, result.rewards, result.regrets, result.contexts
+    more = {name: getattr(result, name) for name in ("estimates", "moments", "posteriors")}
+    _statistics_on(spec, *pulls, **more).save(run.path / STATISTICS_FILE)
     taken = WorkTime.now() - started - time_compiling()
     figures = {"n_runs": n_runs, "n_timesteps": len(result.arms[0]), "engine": engine}
     run.record(spec, FINISHED, **figures, **taken.as_data())
@@ -286,23 +255,10 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
     from rl_yardstick.agents.compiled.worlds import NotCompilable
     from rl_yardstick.pipeline.components import constructor_arguments
 
-    arguments: tuple[Any, ...] = (
-        spec.algo,
-        constructor_arguments(spec, load_algorithm(spec.algo), is_dict=False),
-        spec.env_id,
-        spec.env_kwargs,
-        range(spec.seed, spec.seed + n_runs),
-        spec.n_timesteps,
-    )
+    own = constructor_arguments(spec, load_algorithm(spec.algo), is_dict=False)
+    place, seeds = (spec.env_id, spec.env_kwargs), range(spec.seed, spec.seed + n_runs)
+    arguments: tuple[Any, ...] = (spec.algo, own, *place, seeds, spec.n_timesteps)
     try:
         return run_batch(*arguments), "compiled batch"
     except NotCompilable as reason:
         return run_one_by_one(*arguments), f"one by one: {reason}"
-
-
-def _check_rewards(result: BatchResult, first_seed: int) -> None:
-    """Refuse rewards that are not finite."""
-    for seed, rewards in enumerate(result.rewards, start=first_seed):
-        if not np.isfinite(rewards).all():
-            pull = int(np.argmin(np.isfinite(rewards)))
-            raise UserError(f"reward of seed {seed} at step {pull + 1:,} is {rewards[pull]}")

@@ -26,16 +26,8 @@ from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown
 from rl_yardstick.pipeline.run import Stop, versions
 from rl_yardstick.pipeline.settings import read_yaml
 
-# The classes of dask-jobqueue by system.
-QUEUES = {
-    "htcondor": "HTCondorCluster",
-    "lsf": "LSFCluster",
-    "moab": "MoabCluster",
-    "oar": "OARCluster",
-    "pbs": "PBSCluster",
-    "sge": "SGECluster",
-    "slurm": "SLURMCluster",
-}
+# The systems of dask-jobqueue, in the names of its classes.
+SYSTEMS = ("HTCondor", "LSF", "Moab", "OAR", "PBS", "SGE", "SLURM")
 _ONE_AT_A_TIME = threading.Lock()  # the libraries' generators belong to a whole process
 
 
@@ -114,19 +106,20 @@ class ClusterWorkers(Workers):
 def _job_queue(path: Path, n_jobs: int) -> Any:
     """Jobs of a queueing system, as dask-jobqueue's own YAML describes them."""
     content = read_yaml(path)
-    queues = content.get("jobqueue") if isinstance(content, dict) else None
-    if not isinstance(queues, dict) or len(queues) != 1:
+    asked = content.get("jobqueue") if isinstance(content, dict) else None
+    if not isinstance(asked, dict) or len(asked) != 1:
         raise UserError(f"{path} must hold the key jobqueue, and in it one queueing system")
-    ((system, given),) = queues.items()
-    if system not in QUEUES or not isinstance(given, dict):
-        raise UserError(f"{path}: {shown(system)} is none of {', '.join(QUEUES)}")
+    ((system, given),) = asked.items()
+    queues = {name.lower(): getattr(dask_jobqueue, f"{name}Cluster") for name in SYSTEMS}
+    if system not in queues or not isinstance(given, dict):
+        raise UserError(f"{path}: {shown(system)} is none of {', '.join(queues)}")
     if n_jobs < 1:
         raise UserError(f"{path}: say how many runs to do at once: --jobs N")
     settings = {str(name).replace("_", "-"): value for name, value in given.items()}
     settings["processes"] = settings.get("cores")  # one run in each
     # The library's own defaults for what the file leaves out.
     dask.config.set({f"jobqueue.{system}": {**dask.config.get(f"jobqueue.{system}"), **settings}})
-    cluster = getattr(dask_jobqueue, QUEUES[system])()
+    cluster = queues[system]()
     cluster.scale(n_jobs)
     return cluster
 

@@ -45,13 +45,8 @@ RIDGE = 1.0  # the weight of each coefficient's prior, in pulls
 def arm_means(contexts: Ints, arms: Ints, rewards: Floats, shape: tuple[int, int]) -> Floats:
     """The mean reward of each arm in each context; without pulls, the arm's overall mean.
 
-    A saturated model: it assumes nothing about rewards.
-
-    Args:
-        contexts: integers from 0, shape (n,).
-        arms: shape (n,).
-        rewards: shape (n,).
-        shape: numbers of contexts and arms, the shape of the result.
+    A saturated model: it assumes nothing about rewards. Contexts are integers from 0, shape (n,);
+    the result has the ``shape`` of the numbers of contexts and arms.
     """
     cells, size = contexts * shape[1] + arms, shape[0] * shape[1]
     counts = np.bincount(cells, minlength=size).reshape(shape)
@@ -94,12 +89,8 @@ def cross_fit(
 ) -> Floats:
     """The mean reward of each arm before each pull, shape (n, n_arms), from the other folds' pulls.
 
-    Args:
-        contexts: integers from 0, shape (n,), for means; or vectors, shape (n, d), for regressions.
-        arms: shape (n,).
-        rewards: shape (n,).
-        n_arms: number of arms, including arms that were not pulled.
-        n_folds: number of random parts of the pulls.
+    Contexts are integers from 0, shape (n,), for means; or vectors, shape (n, d), for regressions.
+    ``n_arms`` counts arms that were not pulled, too.
 
     Raises:
         ValueError: if there are fewer than two pulls.
@@ -120,11 +111,9 @@ def cross_fit(
 
 # --- the estimators -------------------------------------------------------------------------------
 
-# By how many standard errors the mean weight may differ from 1 before the log is refused. Chance
-# causes this only if the log has almost none of the policy's actions.
-MOST_ERRORS = 5.0
-# An additional tolerance, because files round propensities.
-ROUNDED = 0.02
+# By how many standard errors the mean weight may differ from 1 before the log is refused, and a
+# tolerance beside, because files round propensities.
+MOST_ERRORS, ROUNDED = 5.0, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +136,8 @@ def evaluate_policy(
     Args:
         policy: its probability of each arm at each pull, shape (n, n_arms).
         arms: the arms pulled, shape (n,).
-        rewards: their rewards, shape (n,).
-        propensities: the log's probability of each pulled arm, shape (n,).
+        rewards: their rewards, likewise.
+        propensities: the log's probabilities of these arms, likewise.
         predicted: mean reward of each arm at each pull; see `cross_fit`.
 
     Raises:
@@ -190,16 +179,9 @@ def difference_in_value(
 
     The standard deviation of the terms has a lower bound: its value if rewards had the same noise
     everywhere. If few pulls inform a choice, all may have had equal rewards by chance, and the
-    terms alone would look too certain.
-
-    Args:
-        first: the terms of one policy.
-        second: the terms of the other, on the same log.
-        n_comparisons: the number of comparisons; the intervals of all of them hold
-            simultaneously with 95 %.
+    terms alone would look too certain. All ``n_comparisons`` hold together with 95 %.
     """
-    confidence = 1 - 0.05 / n_comparisons
-    found = mean_reward(first.doubly_robust - second.doubly_robust, confidence)
+    found = mean_reward(first.doubly_robust - second.doubly_robust, 1 - 0.05 / n_comparisons)
     apart = first.weights - second.weights
     variance = float((apart**2).mean() * (first.errors**2).mean()) / len(apart)
     half = float(stats.t.isf(0.05 / n_comparisons / 2, len(apart) - 1)) * np.sqrt(variance)
@@ -330,16 +312,10 @@ class Comparison:
     notes: tuple[str, ...]  # notes for reading the figures
 
 
-# Settings that change an agent's observations, so that they differ from the log's contexts.
-_OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
-
-
 def read_logged(path: Path, columns: Mapping[str, str] | None = None) -> LoggedData:
     """Read a log with propensities.
 
-    Args:
-        path: the CSV file.
-        columns: the file's names of ``arm``, ``reward`` and ``propensity``, where they differ.
+    ``columns`` has the file's names of ``arm``, ``reward`` and ``propensity``, where they differ.
 
     Raises:
         UserError: if it cannot be read or lacks them.
@@ -367,7 +343,9 @@ def load_policy(path: Path, typed: Sequence[str] = ()) -> LoggedPolicy:
 
     wanted = Wanted(path, env_id="ReplayBandit-v0", typed=list(typed), device="cpu")
     model = find_model(wanted)
-    if changed := next((key for key in _OBSERVATION_SETTINGS if getattr(model.spec, key)), None):
+    # Settings that change an agent's observations, so that they differ from the log's contexts.
+    keys = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
+    if changed := next((key for key in keys if getattr(model.spec, key)), None):
         raise UserError(f"{path} was trained with {changed}: it observes more than a log holds")
     agent = load_agent(model)
     if not isinstance(agent.action_space, spaces.Discrete):
@@ -382,7 +360,14 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
     Raises:
         UserError: if a policy does not fit the log, or the log cannot support an estimate.
     """
-    predicted = predictions(data, max([data.n_arms, *(_n_arms(p.agent) for p in policies)]))
+    spaces_of_actions: list[Any] = [policy.agent.action_space for policy in policies]
+    space = data.observation_space
+    contexts = data.contexts if not isinstance(space, spaces.Discrete) else data.observations(space)
+    n_arms = max([data.n_arms, *(int(space.n) for space in spaces_of_actions)])
+    try:  # means for Discrete contexts, else regressions
+        predicted = cross_fit(contexts, data.arms, data.rewards, n_arms)
+    except ValueError as error:
+        raise UserError(f"{data.source}: {one_line(error)}") from error
     notes = [note for policy in policies for note in _notes(data, policy)]
     rows = [
         Judged(policy.name, _judge(data, policy.name, probabilities(policy, data), predicted), True)
@@ -402,21 +387,6 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
     return Comparison(data, (*rows, Judged("as logged", as_logged)), tuple(notes))
 
 
-def predictions(data: LoggedData, n_arms: int) -> Floats:
-    """The mean reward of each arm at each pull: means for Discrete contexts, else regressions.
-
-    Raises:
-        UserError: if there are too few pulls.
-    """
-    space = data.observation_space
-    discrete = isinstance(space, spaces.Discrete)
-    contexts = data.observations(space) if discrete else data.contexts
-    try:
-        return cross_fit(contexts, data.arms, data.rewards, n_arms)
-    except ValueError as error:
-        raise UserError(f"{data.source}: {one_line(error)}") from error
-
-
 def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
     """The probability of each arm at each logged pull, shape (n, arms of the agent).
 
@@ -431,19 +401,9 @@ def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
         observations = data.observations(agent.observation_space)
     except ValueError as error:
         raise UserError(f"{policy.name}: {one_line(error)}") from error
-    reason = why_not_exact(agent, observations)
-    if reason:
+    if reason := why_not_exact(agent, observations):
         raise UserError(f"{policy.name} cannot be judged on a log: {reason}")
-    try:
-        return policy_matrix(agent, observations)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{policy.name} cannot be judged on a log: {one_line(error)}") from error
-
-
-def _n_arms(agent: BaseAlgorithm) -> int:
-    """The number of arms of an agent."""
-    assert isinstance(agent.action_space, spaces.Discrete)
-    return int(agent.action_space.n)
+    return policy_matrix(agent, observations)
 
 
 def _judge(data: LoggedData, name: str, policy: Floats, predicted: Floats) -> PolicyTerms:
@@ -469,12 +429,9 @@ def _notes(data: LoggedData, policy: LoggedPolicy) -> list[str]:
         return [f"{policy.name} was trained on this log: its figures flatter it; judge by another"]
     trained = read_logged(policy.log)
     if trained.categories != data.categories:
+        theirs, ours = (", ".join(log.categories or ["numbers"]) for log in (trained, data))
         raise UserError(
-            f"{policy.name} was trained on {policy.log}, whose contexts are "
-            f"{_listed(trained)}; those of {data.source} are {_listed(data)}"
+            f"{policy.name} was trained on {policy.log}, whose contexts are {theirs}; those of "
+            f"{data.source} are {ours}"
         )
     return []
-
-
-def _listed(data: LoggedData) -> str:
-    return "numbers" if data.categories is None else ", ".join(data.categories)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,6 @@ MAY_DIFFER = (
     *("origins", "map_name", "tensorboard_log", "gym_packages", "save_every_n_episodes"),
     *("pictures", "log_interval", "library_log"),
 )
-MOST_RUNS = 1_000_000
 FINAL_EPISODES = 100  # of the sampled evaluation at the end of a run
 
 Labels = tuple[str, str]  # of agent and environment
@@ -68,11 +67,9 @@ class PlannedRun:
     seed: int  #: its seed
     spec: TrainSpec  #: its specification
     path: Path  #: its folder
-    #: Whether it is a batch of all seeds of a bandit agent; ``seed`` is the first.
-    is_batch: bool = False
+    is_batch: bool = False  #: of all seeds of a bandit agent; ``seed`` is the first
     n_runs: int = 1  #: the number of runs in the batch
-    #: Whether some agent here has a memory: then the optimum with memory is the scale of all.
-    on_memory_scale: bool = False
+    on_memory_scale: bool = False  #: whether some agent here has a memory
 
     @property
     def labels(self) -> Labels:
@@ -132,22 +129,19 @@ def plan(
     counts: Mapping[Labels, int] | None = None,
     specs: Specs | None = None,
 ) -> list[PlannedRun]:
-    """Plan all runs of a study, ordered by seed, so that agents can be compared early.
+    """Plan all runs of a study in the folder ``root``, by seed: agents can be compared early.
 
-    Args:
-        study: the study.
-        root: its folder.
-        counts: by labels of agent and environment, the number of seeds; by default all.
-        specs: by these labels, what is trained; by default from the study, see `specs_of`.
+    ``counts`` has the number of seeds by labels of agent and environment, by default all; ``specs``
+    what is trained, by default `specs_of` the study.
     """
     specs = specs or specs_of(study)
-    folders = {environment.label: environment.folder for environment in study.environments}
+    folders = {one.label: one.folder for one in study.environments}
     batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
     with_memory = {environment for (_, environment), spec in specs.items() if remembers(spec)}
     planned = []
     for seed, (labels, spec) in product(study.seeds, specs.items()):
-        n_seeds, is_first = (counts or {}).get(labels, study.n_seeds), seed == study.first_seed
-        is_batch = labels in batches
+        n_seeds, is_batch = (counts or {}).get(labels, study.n_seeds), labels in batches
+        is_first = seed == study.first_seed
         if not is_first and (is_batch or seed - study.first_seed >= n_seeds):
             continue
         # From 1, because 0 means the newest run in rl_zoo3's tools.
@@ -169,12 +163,6 @@ def specs_of(study: StudySpec) -> dict[Labels, TrainSpec]:
     Raises:
         UserError: if an agent's settings are invalid, or it does not fit an environment.
     """
-    n_agents, n_environments = len(study.agents), len(study.environments)
-    if (n_runs := n_agents * n_environments * study.n_seeds) > MOST_RUNS:
-        raise UserError(
-            f"{study.name}: {n_agents:,} agents on {n_environments:,} environments with "
-            f"{study.n_seeds:,} seeds are {n_runs:,} runs; a study has {MOST_RUNS:,} at most"
-        )
     _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
     _check_folders("environments", [(one.label, one.folder) for one in study.environments])
     specs = {}
@@ -196,10 +184,8 @@ def _check_folders(what: str, places: Sequence[tuple[str, str]]) -> None:
         # Some file systems ignore case, and the difference of "ä" and "a" with a combining mark.
         key = normalize("NFC", folder.casefold())
         if key in taken:
-            raise UserError(
-                f"{what}: {taken[key]!r} and {label!r} would share the folder {folder}: "
-                "give them labels that differ in letters or digits"
-            )
+            both = f"{what}: {taken[key]!r} and {label!r} would share the folder {folder}"
+            raise UserError(f"{both}: give them labels that differ in letters or digits")
         taken[key] = label
 
 
@@ -208,8 +194,14 @@ def _is_batch(spec: TrainSpec) -> bool:
     entry = ALGORITHMS[spec.algo]
     if not (entry.for_bandits and entry.package is None) or spec.n_timesteps is None:
         return False
-    if entry.family != "bandits" and not _is_compiled_bandit(spec.algo):
-        return False
+    if entry.family != "bandits":
+        from rl_yardstick.agents import load_algorithm
+        from rl_yardstick.agents.bandits.linear import LinearBanditAgent
+        from rl_yardstick.agents.bandits.tables import TableBandit
+
+        # A user's agent may be a subclass.
+        if not issubclass(load_algorithm(spec.algo), TableBandit | LinearBanditAgent):
+            return False
     with closing(make_single_env(spec)) as env:
         if spec.n_timesteps > (time_limit(env) or 0):
             return False
@@ -217,25 +209,15 @@ def _is_batch(spec: TrainSpec) -> bool:
     return not spec.hyperparams.keys() - {"n_timesteps", "env_kwargs", *spec.algorithm}
 
 
-def _is_compiled_bandit(algo: str) -> bool:
-    """Whether a user's agent is a subclass of this project's compiled bandit agents."""
-    from rl_yardstick.agents import load_algorithm
-    from rl_yardstick.agents.bandits.linear import LinearBanditAgent
-    from rl_yardstick.agents.bandits.tables import TableBandit
-
-    return issubclass(load_algorithm(algo), TableBandit | LinearBanditAgent)
-
-
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
     check_agent(agent.algo)
     entry, origins = _entry(agent, environment)
-    name = map_name(environment.env_id, entry)
     spec = read_spec(
         agent.algo,
         environment.env_id,
         with_files_read(environment.env_id, entry),
         origins=origins,
-        map_name=name,
+        map_name=map_name(environment.env_id, entry),
         pictures=False,
         eval_freq=study.eval_freq,
         eval_episodes=study.eval_episodes,
@@ -250,13 +232,12 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
 # In half of the steps, some networks would train in the library's loop, and take longer.
 QUICK_TABLE_STEPS, QUICK_STEPS = 200_000, 20_000
 STEPS_OF_EPISODE = 100
-# The library's agents that can train in compiled code.
-NETWORKS = frozenset({"dqn", "double_dqn", "deep_qlearning", "ppo", "a2c"})
 
 
 def _quickened(spec: TrainSpec, quick: QuickSpec) -> dict[str, int]:
     """A small budget, in the unit of the spec's own."""
-    is_table = spec.algo not in NETWORKS and "compiled" in ALGORITHMS[spec.algo].engines
+    entry = ALGORITHMS[spec.algo]
+    is_table = entry.family != "library" and "compiled" in entry.engines
     steps = QUICK_TABLE_STEPS if is_table else QUICK_STEPS
     found = {}
     for key, most in (("n_timesteps", steps), ("n_episodes", steps // STEPS_OF_EPISODE)):
@@ -300,11 +281,12 @@ class StudyRecord:
 
     def write(self, root: Path) -> None:
         """Write ``study.json``, before the first run."""
-        specs = [
-            {"agent": agent, "environment": environment, "spec": spec.model_dump()}
-            for (agent, environment), spec in self.specs.items()
-        ]
-        study = asdict(self.study, dict_factory=_with_paths_as_texts)
+        items = self.specs.items()
+        specs = [{"agent": a, "environment": e, "spec": s.model_dump()} for (a, e), s in items]
+        study = asdict(
+            self.study,
+            dict_factory=lambda items: {k: str(v) if isinstance(v, Path) else v for k, v in items},
+        )
         write_json(root / RECORD, {"study": study, "looks": self.looks, "specs": specs})
 
     @classmethod
@@ -323,9 +305,7 @@ class StudyRecord:
             own = {"gym_packages": [*study.gym_packages], "trained_agent": None}
             own |= {"tensorboard_log": None, "watch_learning": None}
             specs = {
-                (str(one["agent"]), str(one["environment"])): TrainSpec.model_validate(
-                    {**one["spec"], **own}
-                )
+                (str(one["agent"]), str(one["environment"])): TrainSpec(**{**one["spec"], **own})
                 for one in data["specs"]
             }
             return cls(study, specs, tuple(map(int, data["looks"])))
@@ -333,18 +313,59 @@ class StudyRecord:
             raise UserError(f"{root / RECORD} is no study of this version") from error
 
 
-def _with_paths_as_texts(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    return {key: str(value) if isinstance(value, Path) else value for key, value in pairs}
+# --- studies that get more seeds until all pairs are decided --------------------------------------
+
+MOST_SEEDS = 80
+
+
+def plan_of_looks(study: StudySpec, root: Path, most: int | None) -> tuple[int, ...]:
+    """The seeds at each look of a study, fixed before the first look and kept in ``study.json``.
+
+    ``most`` is the largest number of seeds of an agent; None: as planned before, or ``MOST_SEEDS``.
+
+    Raises:
+        UserError: if this differs from an earlier plan, or there is nothing to decide.
+    """
+    if len(study.agents) < 2:
+        raise UserError(f"{study.name}: --until-decided takes two agents or more")
+    if most is not None and most < study.n_seeds:
+        raise UserError(f"--max-seeds is {most}, the study begins with {study.n_seeds} seeds")
+    before = StudyRecord.read(root) if (root / RECORD).exists() else None
+    if before is None or not before.looks:
+        return look_sizes(study.n_seeds, max(most or MOST_SEEDS, study.n_seeds))
+    looks = look_sizes(study.n_seeds, most or before.looks[-1])
+    there, here = _fixed(before.study, before.looks), _fixed(study, looks)
+    if changed := [f"{k} {there[k]}, now {here[k]}" for k in there if there[k] != here[k]]:
+        raise UserError(
+            f"{root}: the looks were planned before the first of them and cannot change "
+            f"({'; '.join(changed)}): --name NAME makes another study"
+        )
+    return looks
+
+
+def _fixed(study: StudySpec, looks: tuple[int, ...]) -> dict[str, object]:
+    """What must not change from one look to the next."""
+    return {
+        "looks": [*looks],
+        "agents": sorted(agent.label for agent in study.agents),
+        "environments": sorted(environment.label for environment in study.environments),
+        **{name: getattr(study, name) for name in ("metric", "margin", "first_seed", "against")},
+    }
+
+
+def look_sizes(first: int, most: int) -> tuple[int, ...]:
+    """The number of seeds of an agent at each look: twice as many as before, up to ``most``."""
+    sizes = [first]
+    while sizes[-1] < most:
+        sizes.append(min(2 * sizes[-1], most))
+    return tuple(sizes)
 
 
 def other_settings(planned: Sequence[PlannedRun]) -> list[tuple[PlannedRun, dict[str, Any]]]:
     """The finished runs in the folders that have other settings than planned, and these."""
-    found = []
-    for run in planned:
-        recorded = run.recorded()
-        if recorded.get("state") == FINISHED and (there := run.differences(recorded)):
-            found.append((run, there))
-    return found
+    recorded = [(run, run.recorded()) for run in planned]
+    finished = [(run, found) for run, found in recorded if found.get("state") == FINISHED]
+    return [(run, there) for run, found in finished if (there := run.differences(found))]
 
 
 # --- the seeds of a study on which its settings were tuned, as far as known -----------------------
@@ -359,22 +380,24 @@ Seeds = frozenset[int]
 class TuningSeeds:
     """The origin of a study's settings, and the seeds of the study on which they were tuned."""
 
-    #: By agent, the seeds of the study on which its settings in ``hyperparams/`` were tuned; empty
-    #: for agents with their constructor's defaults.
+    #: By agent, those of its settings in ``hyperparams/``; empty for its constructor's defaults.
     shipped: Mapping[str, Seeds]
     files: Mapping[str, Seeds]  #: likewise, by the name of a user's file that lists seeds
     unknown: tuple[str, ...]  #: agents whose settings have unknown tuning seeds
-    #: Agents whose settings were tuned with other environment arguments.
-    elsewhere: tuple[str, ...] = ()
+    elsewhere: tuple[str, ...] = ()  #: agents tuned with other environment arguments
 
 
 def tuning_seeds(study: StudySpec) -> TuningSeeds:
     """Find the tuning seeds for all agents of a study on all its environments."""
-    shipped: dict[str, Seeds] = {}
-    files: dict[str, Seeds] = {}
-    unknown: dict[str, None] = {}
-    elsewhere: dict[str, None] = {}
-    known = lru_cache(maxsize=None)(_said)
+    shipped, files = dict[str, Seeds](), dict[str, Seeds]()
+    unknown, elsewhere = dict[str, None](), dict[str, None]()
+
+    @cache
+    def known(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] | None:
+        with suppress(UserError):  # the file existed when the runs were planned
+            return seeds_tuned_on(algo, env_id, conf_file)
+        return None
+
     for agent, environment in product(study.agents, study.environments):
         label = agent.group or agent.label
         tuned_on = known(agent.algo, environment.env_id, agent.conf_file)
@@ -411,10 +434,3 @@ def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:
 
     keys = [key for key in (*ENV_KWARGS, "train_env_wrapper") if key in own]
     return any(meant(merged, key) != meant(entry, key) for key in keys)
-
-
-def _said(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] | None:
-    try:
-        return seeds_tuned_on(algo, env_id, conf_file)
-    except UserError:  # the file existed when the runs were planned
-        return None

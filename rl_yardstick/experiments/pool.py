@@ -29,16 +29,12 @@ from rl_yardstick.pipeline.run import INTERRUPTED, LOCK, RUNNING, Run, Stop, res
 ERROR_FILE = "error.txt"  # the traceback of a run that failed
 SECONDS_BETWEEN_LINES = 10.0
 GRACE = 30.0  # seconds until stopped runs must have saved their states
-_WINDOWS_OR_MAC = sys.platform in ("win32", "darwin")  # where forked libraries crash
 
 
 def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> None:
     """Do one run in this process, or what is left of it. This is what any pool or cluster calls.
 
-    Args:
-        planned: the run.
-        command: the user's command, for the run folder.
-        stop: asks the run to stop; by default a SIGTERM does.
+    ``command`` is the user's, for the run folder; ``stop`` is None to stop after a SIGTERM.
 
     Raises:
         UserError: with the reason, if the run fails.
@@ -73,17 +69,16 @@ def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> 
 
 def _can_resume(planned: PlannedRun, run: Run) -> bool:
     """Whether the folder has a state of this run, saved with the same versions."""
-    if not run.state_path.exists() or planned.differences(planned.recorded()):
-        return False
     with suppress(UserError):
-        return resumable(run.path) is not None
+        is_this = run.state_path.exists() and not planned.differences(planned.recorded())
+        return is_this and resumable(run.path) is not None
     return False
 
 
 def _clear(planned: PlannedRun) -> None:
     """Remove what an earlier attempt has left."""
     for path in planned.path.iterdir():
-        if path.is_dir() and not path.is_symlink():
+        if path.is_dir():
             shutil.rmtree(path)
         elif path.name != LOCK:
             path.unlink()
@@ -112,11 +107,9 @@ def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
 class Workers:
     """Processes of this machine that do runs, one after another, until the ``with`` ends.
 
-    Args:
+    Attributes:
         n_at_once: their number.
         timeout: seconds for each run; None for any time.
-
-    Attributes:
         words: the workers in a few words.
     """
 
@@ -153,7 +146,8 @@ class Workers:
 
 def process_pool(n_workers: int) -> ProcessPool:
     """A pool of processes that have imported the libraries, and use one thread each."""
-    context: Any = multiprocessing.get_context("spawn" if _WINDOWS_OR_MAC else "forkserver")
+    forks = sys.platform not in ("win32", "darwin")  # where forked libraries crash
+    context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
     context.set_forkserver_preload(["rl_yardstick.pipeline.training"])
     for library in ("OMP", "MKL", "OPENBLAS"):  # small networks are slower with more
         os.environ[f"{library}_NUM_THREADS"] = "1"
@@ -189,20 +183,10 @@ def available_cores() -> int:
 def do_runs(
     runs: Sequence[PlannedRun], workers: Workers, command: str, console: Console, stop: Stop
 ) -> dict[Path, str]:
-    """Do runs in their order; tell the progress, and each run that fails in a line.
-
-    Args:
-        runs: those that are to do.
-        workers: who does them.
-        command: the user's command, for the run folders.
-        console: where progress and failures are printed.
-        stop: after a signal, running ones are stopped at their next safe moment.
+    """Do runs in their order, see `keep_busy`; tell the progress, and each failure in a line.
 
     Returns:
         The reason of each failure, by the folder of the run.
-
-    Raises:
-        Stopped: after a signal.
     """
     failures: dict[Path, str] = {}
     to_do = list(runs)[::-1]
@@ -228,10 +212,10 @@ def keep_busy(
     """Do runs until there is none to begin, and none under way.
 
     Args:
-        workers: who does them.
-        next_run: the next run; None if none can begin before another ends.
+        workers: the workers.
+        next_run: returns the next run; None if none can begin before another ends.
         ended: called after each run, with the reason if it has failed.
-        command: the user's command, for the run folders.
+        command: the user's, for the run folders.
         stop: after a signal, running ones are stopped at their next safe moment.
 
     Raises:
@@ -278,13 +262,13 @@ def _in_words(error: BaseException, run: PlannedRun, timeout: float | None) -> s
 def progress(console: Console, total: int, what: str = "runs") -> Iterator[Callable[[int], None]]:
     """A bar on a terminal, and else a line now and then and at the end.
 
-    Yields what is to be called after each piece of work, with the number of those that have failed.
+    Yields a function to call after each piece of work, with the number of those that have failed.
     """
     begun = told_at = time.monotonic()
     columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    failed = TextColumn("{task.description}")
+    failures = TextColumn("{task.description}")
     is_live = console.is_terminal and total > 0
-    with Progress(*columns, failed, console=console, transient=True, disable=not is_live) as bar:
+    with Progress(*columns, failures, console=console, transient=True, disable=not is_live) as bar:
         task, n_done = bar.add_task("", total=total), 0
 
         def advance(n_failed: int) -> None:
@@ -294,8 +278,7 @@ def progress(console: Console, total: int, what: str = "runs") -> Iterator[Calla
             bar.update(task, advance=1, description=words.removeprefix(", "))
             now = time.monotonic()
             if not is_live and (n_done == total or now - told_at > SECONDS_BETWEEN_LINES):
-                told_at = now
-                text = f"{n_done} of {total} {what} in {now - begun:.0f} s{words}"
-                console.print(text, highlight=False)
+                told_at, done = now, f"{n_done} of {total} {what}"
+                console.print(f"{done} in {now - begun:.0f} s{words}", highlight=False)
 
         yield advance

@@ -15,8 +15,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from rl_yardstick.experiments.bandits import STATISTICS_FILE, PullStatistics, read_pulls, run_regret
-from rl_yardstick.experiments.plan import PlannedRun
-from rl_yardstick.experiments.study import StudySpec
+from rl_yardstick.experiments.plan import Labels, PlannedRun
+from rl_yardstick.experiments.study import AS_IT_IS, SHIPPED, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.curve_pictures import MEANINGS, read_diagnosis
 from rl_yardstick.pipeline.errors import UserError, one_line
@@ -106,64 +106,27 @@ def read_compared(folder: Path) -> dict[str, Floats]:
 
 # --- learning curves ------------------------------------------------------------------------------
 
-TRAINING_POINTS = 100
+TRAINING_POINTS = 100  # the most points of a run, and of a mean curve
 
 # Columns of `StudyResults.curves`. Each row is an evaluation, or the mean return of consecutive
-# training episodes at the end of the last one.
-CURVE_COLUMNS = (
-    "agent",
-    "environment",
-    "seed",
-    "kind",  # "evaluation" or "training"
-    "step",
-    "episode",
-    "seconds",
-    "value",  # return
-)
+# training episodes at the end of the last one. ``kind`` is "evaluation" or "training".
+_LABELS = ("agent", "environment", "seed", "kind")
+CURVE_COLUMNS = (*_LABELS, "step", "episode", "seconds", "value")
 
-
-@dataclass(frozen=True)
-class Curve:
-    """A learning curve of one run."""
-
-    labels: dict[str, Any]  # the columns of `CURVE_COLUMNS` that are constant in the curve
-    figures: dict[str, Floats]  # the other columns, each of shape (n,)
-
-
-def joined(curves: Sequence[Curve]) -> pd.DataFrame:
-    """The curves as one table."""
-    if not curves:
-        return pd.DataFrame(columns=CURVE_COLUMNS)
-    lengths = [len(curve.figures["step"]) for curve in curves]
-    columns: dict[str, Any] = {
-        name: np.repeat([curve.labels[name] for curve in curves], lengths)
-        for name in curves[0].labels
-    }
-    columns |= {
-        name: np.concatenate([curve.figures[name] for curve in curves])
-        for name in curves[0].figures
-    }
-    return pd.DataFrame(columns, columns=list(CURVE_COLUMNS))
-
-
-def _curve(planned: PlannedRun, kind: str, figures: dict[str, Floats]) -> Curve:
-    labels = {"agent": planned.agent, "environment": planned.environment}
-    return Curve({**labels, "seed": planned.seed, "kind": kind}, figures)
+Curve = dict[str, Any]  # of one run: labels, and the other columns, each of shape (n,)
 
 
 def evaluation_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
     """Mean returns of the evaluations during training."""
     steps, returns = read_evaluations(planned.path)
-    seconds = np.interp(
-        steps, np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
-    )
-    columns = {
+    begun = np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
+    return {
+        **_labels(planned, "evaluation"),
         "step": steps,
         "episode": np.searchsorted(episodes.steps, steps, side="right").astype(np.float64),
-        "seconds": seconds,
+        "seconds": np.interp(steps, *begun),
         "value": returns,
     }
-    return _curve(planned, "evaluation", columns)
 
 
 def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
@@ -173,13 +136,29 @@ def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
     ends = np.minimum(np.arange(block, n + block, block), n)
     starts = np.arange(0, n, block)
     sums = np.add.reduceat(episodes.returns, starts) if n else np.empty(0)
-    columns = {
+    return {
+        **_labels(planned, "training"),
         "step": episodes.steps[ends - 1],
         "episode": ends.astype(np.float64),
         "seconds": episodes.seconds[ends - 1],
         "value": sums / (ends - starts),
     }
-    return _curve(planned, "training", columns)
+
+
+def _labels(planned: PlannedRun, kind: str) -> Curve:
+    labels = (planned.agent, planned.environment, planned.seed, kind)
+    return dict(zip(_LABELS, labels, strict=True))
+
+
+def joined(curves: Sequence[Curve]) -> pd.DataFrame:
+    """The curves as one table."""
+    lengths = [len(curve["step"]) for curve in curves]
+    columns = {name: [curve[name] for curve in curves] for name in CURVE_COLUMNS if curves}
+    found = {
+        name: np.repeat(values, lengths) if name in _LABELS else np.concatenate(values)
+        for name, values in columns.items()
+    }
+    return pd.DataFrame(found, columns=list(CURVE_COLUMNS))
 
 
 # --- the results of runs --------------------------------------------------------------------------
@@ -212,67 +191,30 @@ class StudyResults:
     summary: pd.DataFrame  #: one row for each finished run, see `RUN_COLUMNS`
     curves: pd.DataFrame  #: learning curves of all runs, see `CURVE_COLUMNS`
     planned: tuple[PlannedRun, ...]  #: all runs of the study, including failed ones
-    #: On bandits, figures by pull, by labels of agent and environment.
-    pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
+    pulls: Mapping[Labels, PullStatistics] = field(default_factory=dict)  #: on bandits
     left_out: tuple[LeftOut, ...] = ()  #: finished runs with files that cannot be read
     finished: tuple[PlannedRun, ...] = ()  #: the runs in the results
-    #: The error messages of runs that have just failed, by folder.
-    failures: Mapping[Path, str] = field(default_factory=dict)
+    failures: Mapping[Path, str] = field(default_factory=dict)  #: why runs have just failed
 
-
-# Columns of `StudyResults.summary`; returns are undiscounted sums of rewards.
-RUN_COLUMNS = (
-    "agent",
-    "algo",
-    "environment",
-    "env_id",
-    "seed",
-    "final",  # return of the final policy
-    "final_std",  # standard deviation of an episode's return
-    "final_length",
-    "success_rate",
-    "exact",  # whether these are exact expectations, not means of episodes
-    "optimum",
-    "optimum_at_least",  # lower bound, if ``optimum`` is only an upper bound
-    "optimum_is_proven",  # whether this upper bound is proven
-    "baseline",
-    "gap",  # optimum minus final
-    "score",  # final return, scaled: 0 is the best random or constant policy, 1 the optimum
-    "acts_by",  # description of the policy in training: "epsilon 0.01", "its own distribution"
-    "stochastic_return",  # exact return of this policy
-    "discount",  # the agent's discount
-    "discounted_return",  # exact return of the final policy under this discount
-    "discounted_optimum",  # the optimum under this discount
-    "best",  # highest return of an evaluation during training
-    "best_timesteps",
-    "area",  # mean return over the learning curve
-    "training",  # mean return of the training episodes
-    "last_episodes",  # mean return of the last 100 training episodes
-    "regret",  # on bandits, the sum of best expected rewards minus those of the pulled arms
-    "threshold",
-    "steps_to_threshold",  # infinite if it was never reached
-    "steps_to_stay",  # until the threshold was reached for good
-    "episodes_to_threshold",
-    "episodes_to_stay",
-    "n_timesteps",
-    "n_episodes",
-    "seconds",
-    "cpu_seconds",  # of the run's process
-    "engine",
-    "path",
-)
 
 # Further columns, if some environment is partially observable: the optimum of agents that see the
 # state, and the input of the policies that reach ``optimum``, "observation" or "memory".
 HIDDEN_COLUMNS = ("full_optimum", "measured_by")
-
 # Columns with the same name in ``run.json``, under ``final`` and beside it.
 _OF_FINAL = (
     *("success_rate", "exact", "optimum", "optimum_at_least", "optimum_is_proven", "baseline"),
     *("gap", "score", "acts_by", "stochastic_return", "discount", "discounted_return"),
-    *("discounted_optimum", *HIDDEN_COLUMNS),
+    "discounted_optimum",
 )
 _OF_RUN = ("best_timesteps", "n_timesteps", "seconds", "cpu_seconds", "engine")
+# Columns of `StudyResults.summary`, explained in docs/compare.md; returns are undiscounted sums.
+RUN_COLUMNS = (
+    *("agent", "algo", "environment", "env_id", "seed"),
+    *("final", "final_std", "final_length", *_OF_FINAL),
+    *("best", "best_timesteps", "area", "training", "last_episodes", "regret", "threshold"),
+    *("steps_to_threshold", "steps_to_stay", "episodes_to_threshold", "episodes_to_stay"),
+    *("n_timesteps", "n_episodes", "seconds", "cpu_seconds", "engine", "path"),
+)
 
 
 def read_results(
@@ -283,25 +225,20 @@ def read_results(
 ) -> StudyResults:
     """Read all finished runs, except runs with files that cannot be read.
 
-    Args:
-        study: the study.
-        planned: the runs.
-        root: the study's folder.
-        known: runs that have been read before; those that are read now are added.
+    ``known`` has the runs that have been read before; those that are read now are added.
     """
     known = {} if known is None else known
-    found, done, left_out = [], [], []
+    done, left_out = [], []
     for run in planned:
-        key = run.path, run.n_runs
         try:
-            results = known.get(key) or read_run(study, run)
+            results = known.get((run.path, run.n_runs)) or read_run(study, run)
         except (UserError, OSError) as error:
             left_out.append(LeftOut(run, one_line(error)))
             continue
         if results is not None:
-            known[key] = results
-            found.append(results)
+            known[run.path, run.n_runs] = results
             done.append(run)
+    found = [known[run.path, run.n_runs] for run in done]
     rows = [row for results in found for row in results.rows]
     is_hidden = any(row.get("full_optimum") is not None for row in rows)
     columns = [*RUN_COLUMNS, *(HIDDEN_COLUMNS if is_hidden else ())]
@@ -328,20 +265,23 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
         return None
     try:
         if planned.is_batch:
-            return RunResults(_batch_rows(planned, recorded))
-        episodes = read_episodes(planned.path)
-        evaluations = evaluation_curve(planned, episodes)
-        row = _summary_row(study, planned, recorded, episodes, evaluations)
+            rows, curves = _batch_rows(planned, recorded), []
+        else:
+            episodes = read_episodes(planned.path)
+            curves = [evaluation_curve(planned, episodes), training_curve(planned, episodes)]
+            rows = [_summary_row(study, planned, recorded, episodes, curves[0])]
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{planned.path / RECORD} is damaged: {error!r}") from error
-    return RunResults([row], [evaluations, training_curve(planned, episodes)])
+    spec, path = planned.spec, str(planned.path)
+    named = {"agent": planned.agent, "environment": planned.environment, "path": path}
+    named |= {"algo": spec.algo, "env_id": spec.env_id}
+    return RunResults([named | row for row in rows], curves)
 
 
 def _batch_rows(planned: PlannedRun, recorded: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Make a row of the summary for each run of a batch."""
     pulls = PullStatistics.load(planned.path / STATISTICS_FILE)
     shared = {
-        **_named(planned),
         "n_timesteps": planned.spec.n_timesteps,
         "n_episodes": 1,
         "seconds": recorded["seconds"] / planned.n_runs,
@@ -364,44 +304,31 @@ def _summary_row(
 ) -> dict[str, Any]:
     final = recorded["final"] or {}
     final = with_memory(final) if planned.on_memory_scale else final
-    steps, values = evaluations.figures["step"], evaluations.figures["value"]
+    steps, values = evaluations["step"], evaluations["value"]
+    returns = episodes.returns if len(episodes.returns) else np.array([np.nan])
     return {
-        **_named(planned),
         "seed": planned.seed,
         "final": final.get("mean_return"),
         "final_std": final.get("std_return"),
         "final_length": final.get("mean_length"),
-        **{name: final.get(name) for name in _OF_FINAL},
+        **{name: final.get(name) for name in (*_OF_FINAL, *HIDDEN_COLUMNS)},
         "best": recorded["best_mean_return"],
-        "area": _area(steps, values) if len(steps) else None,
-        "training": _mean(episodes.returns),
-        "last_episodes": _mean(episodes.returns[-LAST_EPISODES:]),
+        "area": _area(steps, values),
+        "training": float(returns.mean()),
+        "last_episodes": float(returns[-LAST_EPISODES:].mean()),
         "regret": run_regret(planned),
-        **speed_figures(study, planned.spec.env_id, final, evaluations.figures),
+        **speed_figures(study, planned.spec.env_id, final, evaluations),
         "n_episodes": len(episodes.returns),
         **{name: recorded[name] for name in _OF_RUN},
     }
 
 
-def _mean(values: Floats) -> float:
-    return float(values.mean()) if len(values) else float("nan")
-
-
-def _area(steps: Floats, values: Floats) -> float:
+def _area(steps: Floats, values: Floats) -> float | None:
     """The mean height of a curve: the trapezoidal rule, divided by its span."""
+    if not len(steps):
+        return None
     span = float(steps[-1] - steps[0])
     return float(np.trapezoid(values, steps)) / span if span else float(values[-1])
-
-
-def _named(planned: PlannedRun) -> dict[str, Any]:
-    """The columns of the summary that identify a run, without its seed."""
-    return {
-        "agent": planned.agent,
-        "algo": planned.spec.algo,
-        "environment": planned.environment,
-        "env_id": planned.spec.env_id,
-        "path": str(planned.path),
-    }
 
 
 def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float | None:
@@ -421,51 +348,65 @@ def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float 
 
 
 def speed_figures(
-    study: StudySpec, env_id: str, final: dict[str, Any], evaluations: Mapping[str, Floats]
+    study: StudySpec, env_id: str, final: dict[str, Any], evaluations: Curve
 ) -> dict[str, float | None]:
     """The columns of the summary on the threshold, from the curve of a run's evaluations."""
     threshold = threshold_of(study, env_id, final)
-    steps, values = evaluations["step"], evaluations["value"]
-    reached = stayed = float("nan")
-    if threshold is not None and len(steps):
-        reached = steps_to_threshold(steps, values, threshold)
-        stayed = steps_to_threshold(steps, values, threshold, to_stay=True)
-
-    def episodes_by(step: float) -> float:
-        there = np.isfinite(step)
-        return float(evaluations["episode"][np.searchsorted(steps, step)]) if there else step
-
-    return {
-        "threshold": threshold,
-        "steps_to_threshold": reached,
-        "steps_to_stay": stayed,
-        "episodes_to_threshold": episodes_by(reached),
-        "episodes_to_stay": episodes_by(stayed),
-    }
+    steps, values, found = evaluations["step"], evaluations["value"], {"threshold": threshold}
+    for name, to_stay in (("threshold", False), ("stay", True)):
+        step = episode = float("nan")
+        if threshold is not None and len(steps):
+            step = episode = steps_to_threshold(steps, values, threshold, to_stay=to_stay)
+        if np.isfinite(step):
+            episode = float(evaluations["episode"][np.searchsorted(steps, step)])
+        found |= {f"steps_to_{name}": step, f"episodes_to_{name}": episode}
+    return found
 
 
 # --- agents over their seeds ---------------------------------------------------------------------
 
-CURVE_POINTS = TRAINING_POINTS  # the most points of a run, and of a curve in a figure
-
 
 def values_over_seeds(results: StudyResults, environment: str, column: str) -> dict[str, Floats]:
     """A column of the summary by agent, shape (n_seeds,); NaN for a missing run."""
-    table = results.summary
-    table = table[table["environment"] == environment]
+    table = results.summary[results.summary["environment"] == environment]
+    labels = [agent.label for agent in results.study.agents]
     pivot = table.pivot(index="seed", columns="agent", values=column)
-    pivot = pivot.reindex(
-        index=results.study.seeds, columns=[a.label for a in results.study.agents]
-    )
+    pivot = pivot.reindex(index=results.study.seeds, columns=labels)
     return {str(agent): pivot[agent].to_numpy(dtype=np.float64, na_value=np.nan) for agent in pivot}
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A change and its results."""
+
+    change: str  #: as typed, or ``"as it is"``
+    returns: Floats  #: of the final policy by seed, NaN for runs that did not finish
+
+    @property
+    def finished(self) -> Floats:
+        """The returns of the runs that finished."""
+        return self.returns[~np.isnan(self.returns)]
+
+    @property
+    def mean(self) -> float:
+        """The mean return of the runs that finished; -inf without one."""
+        return float(self.finished.mean()) if len(self.finished) else -np.inf
+
+
+def tried(results: StudyResults) -> list[Tried]:
+    """The results of an `intervention_study`: as shipped, as it is, then by falling mean return."""
+    returns = values_over_seeds(results, results.study.environments[0].label, "final")
+    unchanged = (SHIPPED, f"{SHIPPED}, {AS_IT_IS}", AS_IT_IS)
+    ranks = {change: rank for rank, change in enumerate(unchanged)}
+    found = [Tried(change, values) for change, values in returns.items()]
+    return sorted(found, key=lambda one: (ranks.get(one.change, len(ranks)), -one.mean))
 
 
 def curves_by_agent(
     results: StudyResults, environment: str
 ) -> dict[tuple[str, str], list[pd.DataFrame]]:
     """The learning curves of runs on an environment, by agent and kind."""
-    table = results.curves
-    table = table[table["environment"] == environment]
+    table = results.curves[results.curves["environment"] == environment]
     found: dict[tuple[str, str], list[pd.DataFrame]] = {}
     for (agent, kind, _), rows in table.groupby(["agent", "kind", "seed"]):
         found.setdefault((str(agent), str(kind)), []).append(rows)
@@ -475,12 +416,7 @@ def curves_by_agent(
 def mean_curve(
     curves: Sequence[pd.DataFrame], by: str, bounds: Bounds = UNBOUNDED
 ) -> tuple[Floats, Band] | None:
-    """The mean learning curve of an agent over its seeds.
-
-    Args:
-        curves: the curves of its runs, from `curves_by_agent`.
-        by: ``"step"``, ``"episode"`` or ``"seconds"``.
-        bounds: the least and the greatest possible return.
+    """The mean of curves of `curves_by_agent`, by ``"step"``, ``"episode"`` or ``"seconds"``.
 
     Returns:
         The points, shape (n,), and the means there with intervals; None without runs, or if a run
@@ -492,7 +428,7 @@ def mean_curve(
     ]
     if not runs or max(points[0] for points, _ in runs) > min(points[-1] for points, _ in runs):
         return None
-    grid = shared_grid([points for points, _ in runs], CURVE_POINTS)
+    grid = shared_grid([points for points, _ in runs], TRAINING_POINTS)
     values = np.array([on_grid(points, returns, grid) for points, returns in runs])
     return grid, curve_band(values, bounds)
 
@@ -503,13 +439,8 @@ def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:
     for info in infos:
         for package, version in info.get("versions", {}).items():
             counts.setdefault(package, Counter())[version] += info.get("n_runs", 1)
-    mixed = [
-        f"{package} {', '.join(_counted(*item) for item in sorted(found.items()))}"
-        for package, found in counts.items()
-        if len(found) > 1
-    ]
+    mixed = []
+    for package, found in counts.items():
+        told = [f"{v} ({n} run{'' if n == 1 else 's'})" for v, n in sorted(found.items())]
+        mixed += [f"{package} {', '.join(told)}"] if len(told) > 1 else []
     return f"runs were done with different versions: {'; '.join(mixed)}" if mixed else ""
-
-
-def _counted(version: str, n_runs: int) -> str:
-    return f"{version} ({n_runs} run{'' if n_runs == 1 else 's'})"

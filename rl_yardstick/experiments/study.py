@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from rl_yardstick.agents.registry import ALGORITHMS
+from rl_yardstick.pipeline.arguments import arguments_of
 from rl_yardstick.pipeline.environments import check_env_id, map_name
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
-from rl_yardstick.pipeline.files import LONGEST_NAME, portable_name, read_text
-from rl_yardstick.pipeline.settings import BUDGETS, ENV_KWARGS, override, read_yaml
+from rl_yardstick.pipeline.files import LONGEST_NAME, plain, portable_name
+from rl_yardstick.pipeline.settings import (
+    BUDGETS,
+    ENV_KWARGS,
+    override,
+    parse_assignments,
+    read_yaml,
+    shipped_hyperparams,
+)
+from rl_yardstick.pipeline.spec import TrainSpec
 
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
 METRICS = get_args(Metric)
@@ -34,7 +42,6 @@ COSTS = ("regret",)  # metrics of which less is better
 OF_TRAINING = ("training", "last_episodes")  # mean returns of training episodes
 # Settings of a training variant of the environment, with the values that switch it off.
 AS_IT_COMES: dict[str, Any] = {"train_env_kwargs": None, "train_env_wrapper": None}
-MOST_AGENTS = 10_000
 MOST_PAIRS = 10  # of agent and environment, for two seeds of each in a quick look
 _SHIPPED = Path(__file__).resolve().parents[1] / "studies"
 
@@ -78,15 +85,13 @@ class AgentSpec:
 
     label: str  #: its name in tables and figures
     algo: str  #: its name in the table of agents
-    #: Hyperparameters that override those of its file.
-    settings: dict[str, Any] = field(default_factory=dict)
-    #: Whether to start from the entry of ``hyperparams/<algo>.yml``; otherwise from the defaults of
-    #: its constructor.
-    tuned: bool = True
-    #: Another file of hyperparameters to start from; None for the shipped one.
-    conf_file: Path | None = None
+    settings: dict[str, Any] = field(default_factory=dict)  #: which override those of its file
+    tuned: bool = (
+        True  #: whether to start from the shipped file, or from the constructor's defaults
+    )
+    conf_file: Path | None = None  #: another file of hyperparameters to start from
     summary: str = ""  #: a short description for the report
-    where: str = field(default="", compare=False)  #: its place in a study file, for messages
+    where: str = field(default="", compare=False)  #: the file with its settings, for messages
     group: str = ""  #: for a member of a sweep, the common label
     swept: dict[str, Any] = field(default_factory=dict)  #: its values of the swept settings
 
@@ -97,8 +102,7 @@ class EnvironmentSpec:
 
     label: str  #: its name in tables and figures
     env_id: str  #: its Gymnasium id
-    #: Hyperparameters of every agent here, such as ``env_kwargs`` and ``n_timesteps``, which
-    #: override those of the agents' files.
+    #: Hyperparameters of every agent here, which override those of the agents' files.
     settings: dict[str, Any] = field(default_factory=dict)
     map_name: str = ""  #: the file of its map, if the label names it
 
@@ -114,11 +118,8 @@ class EnvironmentSpec:
 class QuickSpec:
     """The reduction of a study for a quick look."""
 
-    #: The number of seeds; None for 2, or 1 with more than ten pairs of agent and environment.
-    seeds: int | None = None
-    #: Share of each run's steps or episodes; None for 200,000 steps at most, or 20,000 where the
-    #: agent is no table. An episode counts as 100 steps.
-    budget: float | None = None
+    seeds: int | None = None  #: None for 2, or 1 with more than `MOST_PAIRS`
+    budget: float | None = None  #: share of each run's budget; None: see `plan.QUICK_STEPS`
 
 
 @dataclass(frozen=True)
@@ -131,35 +132,27 @@ class StudySpec:
     environments: tuple[EnvironmentSpec, ...]  #: their environments
     n_seeds: int = 10  #: the number of seeds
     description: str = ""  #: its question, and earlier knowledge
-    #: Environment steps between two evaluations; None for twenty evaluations in a run.
-    eval_freq: int | None = None
+    eval_freq: int | None = None  #: steps between two evaluations; None for twenty in a run
     eval_episodes: int = 20  #: episodes of each sampled evaluation
     metric: Metric = "final"  #: the metric of the verdicts
-    #: Difference of the metric within which two agents are tied; None: 0.02 of the score;
-    #: nothing is tied where there is no score.
+    #: Difference of the metric within which two agents are tied; None: 0.02 of the score.
     margin: float | None = None
-    #: Whether runs of different agents with the same seed share their randomness, as on bandits
-    #: whose arms and rewards are drawn by the seed; if so, they are compared seed by seed.
+    #: Whether runs with the same seed share their randomness, as on bandits whose arms and rewards
+    #: are drawn by the seed; if so, agents are compared seed by seed.
     shared_randomness: bool = False
-    #: Return that counts as solved; None for the point at 95 % of that gap if the optimum is exact,
-    #: else for the environment's registered threshold.
-    threshold: float | None = None
-    #: Episodes per row in the table of training returns; 0 for no table.
-    episodes_table: int = 0
+    threshold: float | None = None  #: return that counts as solved; None: `results.threshold_of`
+    episodes_table: int = 0  #: episodes per row in the table of training returns; 0 for no table
     quick: QuickSpec = field(default_factory=QuickSpec)  #: its reduction for a quick look
     is_quick: bool = False  #: whether it is reduced
     gym_packages: tuple[str, ...] = ()  #: modules that the user typed
     tensorboard: bool = False  #: whether each run writes a TensorBoard log
     render_every: int = 0  #: episodes between two films; 0 for no films
-    #: Whether values and gradients are compared with exact ones at evaluations.
-    diagnose: bool = False
-    #: Whether the page links to pages that play the first training of each agent.
-    learning_pages: bool = False
+    diagnose: bool = False  #: whether evaluations compare values and gradients with exact ones
+    learning_pages: bool = False  #: whether the page links to pages that play first trainings
     figures: tuple[str, ...] = ("png", "svg")  #: formats of figures: "png", "svg", "pdf"
     run_timeout: float | None = None  #: seconds that each run may take; None for no limit
     first_seed: int = 0  #: the first seed; the others follow it
-    #: Label of the only agent to compare the others with; empty for all pairs.
-    against: str = ""
+    against: str = ""  #: label of the only agent to compare the others with; empty for all pairs
 
     @property
     def seeds(self) -> range:
@@ -219,11 +212,11 @@ def _number(value: Any) -> Any:
 
 def _seconds(value: Any) -> Any:
     """A time such as 90, 90s, 10m, 2h or 1d."""
-    found = re.fullmatch(r"([0-9.]+)\s*(|s|m|min|h|d)", str(value).strip())
-    unit = {"m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}.get(found[2], 1.0) if found else 0.0
-    if found is None or found[1].count(".") > 1 or not float(found[1]) * unit > 0:
+    found = re.fullmatch(r"(\d*\.?\d+)\s*(|s|m|min|h|d)", str(value).strip())
+    if found is None or not float(found[1]) > 0:
         raise ValueError(f"must be a time such as 90s, 10m or 2h, not {shown(value)}")
-    return float(found[1]) * unit
+    units = {"m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+    return float(found[1]) * units.get(found[2], 1.0)
 
 
 def _by_label(value: Any) -> Any:
@@ -239,15 +232,10 @@ def _by_label(value: Any) -> Any:
     return {key: entry or {} for key, entry in value.items()} if isinstance(value, dict) else value
 
 
-def _or_empty(value: Any) -> Any:
-    return {} if value is None else value
-
-
 _Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
 _FromZero = Annotated[int, BeforeValidator(_number), Field(ge=0)]
 _Float = Annotated[float, BeforeValidator(_number)]
-_Settings = Annotated[dict[str, Any], BeforeValidator(_or_empty)]
-_Sweep = Annotated[dict[str, Annotated[list[Any], Field(min_length=1)]], BeforeValidator(_or_empty)]
+_Sweep = dict[str, Annotated[list[Any], Field(min_length=1)]]
 
 
 class _Part(BaseModel):
@@ -271,7 +259,7 @@ class _Agent(_Open):
     tuned: bool | None = None
     conf_file: str | None = None
     summary: str = ""
-    sweep: _Sweep = {}
+    sweep: _Sweep | None = None
 
 
 class _Environment(_Open):
@@ -299,9 +287,9 @@ class _File(_Part):
     agents: Annotated[dict[str, _Agent], BeforeValidator(_by_label)] = Field({})
     environments: Annotated[dict[str, _Environment], BeforeValidator(_by_label)] = Field({})
     seeds: Annotated[_Seeds, BeforeValidator(_count)] = _Seeds()
-    settings: _Settings = {}
+    settings: dict[str, Any] = {}
     sweep: _Sweep = {}
-    quick: Annotated[_Quick, BeforeValidator(_or_empty)] = _Quick()
+    quick: _Quick = _Quick()
     n_timesteps: _Count | None = None
     n_episodes: _Count | None = None
     tuned: bool = True
@@ -316,6 +304,7 @@ class _File(_Part):
     run_timeout: Annotated[float, BeforeValidator(_seconds)] | None = None
 
 
+_LISTS = ("agents", "environments")
 # Keys that mean the same as fields of `StudySpec`.
 _SAME = (
     *("description", "eval_freq", "eval_episodes", "metric", "margin", "shared_randomness"),
@@ -323,24 +312,8 @@ _SAME = (
 )
 
 
-@dataclass(frozen=True)
-class _Lines:
-    """A study file, and the line number of each value by its keys."""
-
-    path: Path
-    lines: Mapping[tuple[str | int, ...], int]
-
-    def at(self, *keys: str | int) -> str:
-        """The place of a value, or of what it is in, as ``file:line``."""
-        known = (keys[:n] for n in range(len(keys), 0, -1) if keys[:n] in self.lines)
-        return f"{self.path}:{self.lines[found] if (found := next(known, None)) else 1}"
-
-
 def find_study(given: str) -> Path:
-    """Find a study file: the given path, or else the shipped study of that name.
-
-    Args:
-        given: a path; for a shipped study also ``mine-maze`` or ``studies/mine-maze.yml``.
+    """The given path, or that of a shipped study such as ``mine-maze``, ``studies/mine-maze.yml``.
 
     Raises:
         UserError: if it is a plain name, and neither exists.
@@ -362,27 +335,20 @@ def read_study(path: Path) -> StudySpec:
         UserError: if it cannot be read, or contains unknown or invalid settings.
     """
     data = read_yaml(path)
-    document = _Lines(path, dict(_key_lines(yaml.compose(read_text(path), yaml.SafeLoader), ())))
     if not (isinstance(data, dict) and all(isinstance(key, str) for key in data)):
-        raise UserError(f"{document.at()}: a study must map names to values")
+        raise UserError(f"{path}: a study must map names to values")
     # What is not given is read too: lists of names that are missing.
-    data = {
-        "agents": None,
-        "environments": None,
-        **{k: v for k, v in data.items() if v is not None},
-    }
+    data = dict.fromkeys(_LISTS) | {k: v for k, v in data.items() if v is not None}
     try:
         file = _File.model_validate(data)
     except ValidationError as error:
-        raise _in_one_line(document, error) from None
-    for keys in ((), ("settings",), *((p, label) for p in _LISTS for label in getattr(file, p))):
-        _check_budget(document, data, keys)
+        raise _in_one_line(path, error) from None
     given = {key: value for key in BUDGETS if (value := getattr(file, key)) is not None}
     return StudySpec(
         name=path.stem,
         title=file.title or path.stem,
-        agents=tuple(_agents(document, file)),
-        environments=tuple(_environments(document, file, layered(file.settings, given))),
+        agents=tuple(_agents(path, file)),
+        environments=tuple(_environments(path, file, layered(file.settings, given))),
         n_seeds=file.seeds.count,
         first_seed=file.seeds.first,
         quick=QuickSpec(file.quick.seeds, file.quick.budget),
@@ -390,34 +356,16 @@ def read_study(path: Path) -> StudySpec:
     )
 
 
-_LISTS = ("agents", "environments")
 _PARTS: Mapping[tuple[str, ...], type[_Part]] = {(): _File, ("quick",): _Quick, ("seeds",): _Seeds}
 
 
-def _key_lines(node: Any, keys: tuple[str | int, ...]) -> Iterator[tuple[Any, int]]:
-    """The line numbers, from 1, of the values below a node; items of lists also by their text."""
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            inner = (*keys, str(key.value))
-            yield from _key_lines(value, inner)
-            yield inner, key.start_mark.line + 1
-    elif isinstance(node, yaml.SequenceNode):
-        for item in node.value:
-            if isinstance(item, yaml.ScalarNode):
-                yield (*keys, str(item.value)), item.start_mark.line + 1
-
-
-def _in_one_line(document: _Lines, error: ValidationError) -> UserError:
-    """The first mistake, with its place."""
+def _in_one_line(path: Path, error: ValidationError) -> UserError:
+    """The first mistake, with the keys that lead to it."""
     first = error.errors()[0]
-    keys = tuple(key for key in first["loc"] if key != "[key]")
-    place, value = document.at(*keys), first["input"]
-    key = next(
-        (k for n, k in enumerate(keys[::-1]) if keys[: len(keys) - n] in document.lines), keys[0]
-    )
+    *outer, key = [str(key) for key in first["loc"] if key != "[key]"]
+    place, value = ": ".join([str(path), *outer]), first["input"]
     if first["type"] == "extra_forbidden":
-        known = _PARTS[tuple(map(str, keys[:-1]))].model_fields
-        return unknown(f"{place}: unknown key", str(key), known)
+        return unknown(f"{place}: unknown key", key, _PARTS[tuple(outer)].model_fields)
     if first["type"] == "literal_error":
         return unknown(f"{place}: unknown {key}", str(value), METRICS)
     if first["type"] == "value_error":
@@ -427,31 +375,15 @@ def _in_one_line(document: _Lines, error: ValidationError) -> UserError:
     return UserError(f"{place}: {key} {reason}, not {shown(value)}")
 
 
-def _check_budget(document: _Lines, data: Mapping[str, Any], keys: tuple[str, ...]) -> None:
-    """Refuse two budgets in one mapping."""
-    inner: Any = data
-    for key in keys:
-        inner = inner.get(key) if isinstance(inner, dict) else None
-    if isinstance(inner, dict) and all(inner.get(key) is not None for key in BUDGETS):
-        place = document.at(*keys, BUDGETS[1])
-        raise UserError(f"{place}: give {' or '.join(BUDGETS)}, not both")
-
-
-def _agents(document: _Lines, file: _File) -> list[AgentSpec]:
+def _agents(path: Path, file: _File) -> list[AgentSpec]:
     agents: list[AgentSpec] = []
     for label, entry in file.agents.items():
-        keys = ("agents", label)
         algo = label if entry.algo is None else entry.algo
         if algo not in ALGORITHMS:
-            raise unknown(f"{document.at(*keys, 'algo')}: unknown agent", algo, ALGORITHMS)
-        conf_file = None
-        if entry.conf_file is not None:
-            place = f"{document.at(*keys, 'conf_file')}: conf_file"
-            conf_file = document.path.parent / entry.conf_file
-            if entry.tuned is False:
-                raise UserError(f"{place} and tuned: false contradict each other: leave one out")
-            if not conf_file.is_file():
-                raise UserError(f"{place}: there is no file {conf_file}")
+            raise unknown(f"{path}: unknown agent", algo, ALGORITHMS)
+        conf_file = None if entry.conf_file is None else path.parent / entry.conf_file
+        if conf_file is not None and not conf_file.is_file():
+            raise UserError(f"{path}: {label}: conf_file: there is no file {conf_file}")
         agent = AgentSpec(
             label,
             algo,
@@ -459,29 +391,60 @@ def _agents(document: _Lines, file: _File) -> list[AgentSpec]:
             tuned=file.tuned if entry.tuned is None else entry.tuned,
             conf_file=conf_file,
             summary=entry.summary,
-            where=document.at(*keys),
+            where=str(path),
         )
-        sweep = {**file.sweep, **entry.sweep}
-        n_agents = len(agents) + math.prod(map(len, sweep.values()))
-        if n_agents > MOST_AGENTS:
-            raise UserError(
-                f"{agent.where}: {n_agents:,} agents up to here; a study has {MOST_AGENTS:,} at "
-                "most"
-            )
-        agents += swept(agent, sweep)
+        agents += swept(agent, {**file.sweep, **(entry.sweep or {})})
     if len({agent.group for agent in agents}) == 1 and agents[0].swept:
         agents = [replace(a, label=a.label.removeprefix(f"{a.group} with ")) for a in agents]
     return agents
 
 
-def _environments(
-    document: _Lines, file: _File, shared: Mapping[str, Any]
-) -> Iterator[EnvironmentSpec]:
+def _environments(path: Path, file: _File, shared: Mapping[str, Any]) -> Iterator[EnvironmentSpec]:
     for label, entry in file.environments.items():
         env_id = label if entry.id is None else entry.id
         try:
             check_env_id(env_id)
         except UserError as error:
-            raise UserError(f"{document.at('environments', label, 'id')}: {error}") from error
+            raise UserError(f"{path}: {error}") from error
         as_it_comes = AS_IT_COMES if entry.as_it_comes else {}
         yield EnvironmentSpec(label, env_id, layered(shared, {**as_it_comes, **entry.settings}))
+
+
+# --- changes of the settings of an agent, over four seeds, as evidence for causes -----------------
+
+SHIPPED, AS_IT_IS = "as shipped", "as it is"
+
+
+def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> StudySpec:
+    """Make a study of the agent of the run ``name``, as shipped, unchanged and with each change.
+
+    Changes are typed as ``key:value``, or several of these separated by spaces.
+
+    Raises:
+        UserError: if a change cannot be parsed.
+    """
+    own, shipped = spec.hyperparams, shipped_hyperparams(spec)
+    typed = {change: parse_assignments(change.split(), "--test") for change in changes}
+    settings = {change: layered(own, values) for change, values in typed.items()}
+    first = dict([*settings.items()][:1])  # the likeliest change is trained first
+    unchanged = {SHIPPED: shipped, AS_IT_IS: own}
+    if {**own, "engine": None} == {**shipped, "engine": None}:
+        unchanged = {f"{SHIPPED}, {AS_IT_IS}": own}
+    # Compiled code if possible, unless the settings name an engine.
+    has_auto = "=auto" in arguments_of(spec.algo).get("engine", ())
+    fast: dict[str, Any] = {"engine": "auto"} if has_auto else {}
+    agents = [
+        AgentSpec(change, spec.algo, {**fast, **values}, tuned=False)
+        for change, values in {**first, **unchanged, **settings}.items()
+    ]
+    # Two models of one name share a folder only if their settings are the same.
+    digest = sha256(repr(sorted(plain(own).items())).encode()).hexdigest()[:8]
+    environment = f"{spec.env_id} ({spec.map_name})" if spec.map_name else spec.env_id
+    return StudySpec(
+        name=file_name(f"explain_{name}_{digest}"),
+        title=f"What helps {spec.algo} on {environment}",
+        agents=tuple(agents),
+        environments=(EnvironmentSpec(environment, spec.env_id, map_name=spec.map_name),),
+        n_seeds=4,
+        gym_packages=tuple(spec.gym_packages),
+    )

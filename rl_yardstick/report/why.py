@@ -15,8 +15,8 @@ from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.explanation import Explanation, Parting, StateLoss
-    from rl_yardstick.experiments.interventions import Tried
     from rl_yardstick.experiments.plan import PlannedRun
+    from rl_yardstick.experiments.results import Tried
 
 # A part below this share of the gap has no line.
 LEAST_SHARE = 0.02
@@ -134,7 +134,7 @@ def as_words(change: str) -> str:
 
 def tried_lines(tried: Sequence[Tried], optimum: float) -> list[str]:
     """The returns of each change by seed, and which change helps most; a hint and no verdict."""
-    from rl_yardstick.experiments.interventions import AS_IT_IS, SHIPPED
+    from rl_yardstick.experiments.study import AS_IT_IS, SHIPPED
 
     width = max(len(one.change) for one in tried)
     told = []

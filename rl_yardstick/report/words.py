@@ -229,8 +229,7 @@ class Conclusion(NamedTuple):
 
     lead: str  # who is best, and the optimum
     pairs: tuple[str, ...]  # every word, with figures; several in a sentence
-    # Failures, how soon agents arrive, training on variants, missing runs, what failed agents
-    # do instead, and the number of looks.
+    # Failures, how soon agents arrive, training on variants, missing runs, the number of looks.
     notes: tuple[str, ...]
 
     @property
@@ -247,7 +246,6 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
         *_on_what_cannot_be_compared(study, environment),
         *on_changes([environment]),
         *_on_missing(study, environment),
-        *environment.advice,
         *_on_looks(environment),
     ]
     pairs = tuple(pair_sentences(environment))

@@ -35,6 +35,7 @@ Scale = Literal["linear", "log", "log_below_one", "powers_of_two"]
 # The meaning of a number: a constant, or the start of a schedule.
 FORMS = ("constant", "linear", "exponential")
 LEFT_OUT = object()  # in place of a setting that is not given
+_POINTS = 98  # over a range
 _PREFIXES: Mapping[str, str] = {"log_below_one": "one_minus_", "powers_of_two": "log2_"}
 
 
@@ -200,17 +201,17 @@ class Dimension:
         return replace(self, options={**self.options, word: added})
 
 
-def spread(distribution: BaseDistribution, n: int) -> list[Any]:
-    """At most ``n`` values from one end of a distribution to the other; all words of a choice."""
+def ends(distribution: BaseDistribution) -> list[Any]:
+    """All words of a choice, or the ends of a range; of floats, also one between them."""
     if isinstance(distribution, CategoricalDistribution):
         return list(distribution.choices)
     assert isinstance(distribution, FloatDistribution | IntDistribution)
-    between = np.geomspace if distribution.log else np.linspace
-    values = between(distribution.low, distribution.high, n).tolist()
+    low, high = distribution.low, distribution.high
     if isinstance(distribution, IntDistribution):
-        return sorted({round(value) for value in values})
-    inside = [min(max(tidy(v), distribution.low), distribution.high) for v in values]
-    return list(dict.fromkeys(inside))
+        return [low, high]
+    steps = np.geomspace if distribution.log else np.linspace
+    between = steps(low, high, _POINTS)[1]  # which is rarely a whole number
+    return [low, tidy(between), high]
 
 
 def tidy(number: float) -> float:

@@ -35,7 +35,7 @@ from rl_yardstick.tuning.searching import (
     outcome_of,
     outcomes_of,
 )
-from rl_yardstick.tuning.tuning_spec import COST_OF_THRESHOLD, SHIPPED, Floats, TuningSpec
+from rl_yardstick.tuning.tuning_spec import SHIPPED, STEPS, Floats, TuningSpec
 from rl_yardstick.verdicts import Estimate, Pair, Study, judge, mean_over_runs
 
 FOLDER, WINNER, RECORD = "retest", "winner.yml", "tuning.json"
@@ -181,7 +181,7 @@ def concluded(
     numbers = {SHIPPED: 0} | {label_of(trial): trial.number for trial in chosen}
     figures = {label: np.maximum(_figures(tuning, label, analysis), least) for label in numbers}
     said = analysis.verdicts
-    if tuning.figure in COST_OF_THRESHOLD:  # which the study does not compare
+    if tuning.figure == STEPS:  # which the study does not compare
         scores = {SHIPPED: {label: -values for label, values in figures.items()}}
         said = judge(scores, margin=0, baseline=None, against=SHIPPED)
     words = {name: pair.text for name, pair in _against_shipped(said).items()}

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from optuna.distributions import BaseDistribution, FloatDistribution
+from optuna.distributions import BaseDistribution
 from optuna.trial import FixedTrial, Trial
 from pydantic import ValidationError
 
@@ -28,15 +28,13 @@ from rl_yardstick.tuning.dimensions import (
     Dimension,
     Pick,
     Range,
+    ends,
     is_word,
     same,
-    spread,
 )
 
 # Settings that change the task, so that a search would choose the easiest task.
 _TASK = ("env_kwargs", "eval_env_kwargs")
-# Of so many points over a range, the second is rarely an integer.
-_PARTS = 98
 
 
 @dataclass(frozen=True)
@@ -135,19 +133,15 @@ def _is_there(dimension: Dimension, chosen: Mapping[str, Any]) -> bool:
 
 
 def corners(space: SearchSpace) -> Iterator[dict[str, Any]]:
-    """Settings at the ends of the space: all low, all high, and each end or word separately.
-
-    Of a range of numbers that are not whole, also one between the ends.
-    """
-    ends = {name: spread(kind, 2) for name, kind in space.distributions.items()}
-    lowest = {name: values[0] for name, values in ends.items()}
+    """Settings at the ends of the space: all low, all high, and each of `ends` separately."""
+    values = {name: ends(kind) for name, kind in space.distributions.items()}
+    lowest = {name: several[0] for name, several in values.items()}
     yield space.chosen(lambda name, _: lowest[name])
-    yield space.chosen(lambda name, _: ends[name][-1])
+    yield space.chosen(lambda name, _: values[name][-1])
     for each in space.entries.values():
         needed = _needed(space, each)
-        for name, kind in each.distributions.items():
-            between = spread(kind, _PARTS)[1:2] if isinstance(kind, FloatDistribution) else []
-            for value in (*ends[name], *between):
+        for name in each.distributions:
+            for value in values[name]:
                 params = {**lowest, **needed, name: value}
                 yield space.chosen(lambda name, _: params[name])  # noqa: B023  # called at once
 

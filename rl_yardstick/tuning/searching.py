@@ -2,6 +2,9 @@
 
 The storage is the only record. A search that was killed continues by the same command: trials that
 were under way are taken up again with the same settings, and their finished runs are read.
+
+All trials use the same seeds in the same shuffled order, so that any two trials are compared seed
+by seed.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import optuna
@@ -27,10 +31,9 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.experiments.plan import PlannedRun
-from rl_yardstick.experiments.results import Curve, read_run
+from rl_yardstick.experiments.results import read_run
 from rl_yardstick.pipeline.errors import UserError, one_line, shown
 from rl_yardstick.pipeline.files import plain
-from rl_yardstick.tuning.pruning import is_hopeless
 from rl_yardstick.tuning.search_spaces import read_search_space
 from rl_yardstick.tuning.suggesting import (
     SeededSampler,
@@ -40,16 +43,12 @@ from rl_yardstick.tuning.suggesting import (
     shipped_entry,
     shipped_run,
 )
-from rl_yardstick.tuning.tuning_spec import AUTO, COST_OF_THRESHOLD, TuningSpec, without_secret
-from rl_yardstick.verdicts import steps_to_threshold
+from rl_yardstick.tuning.tuning_spec import AUTO, STEPS, TuningSpec
 
 OWN_FILE = "trials.db"
 SECONDS_TO_WAIT = 120  # for other users of the same database, such as a dashboard
 # If this many trials fail at the start without a success, the settings are not the reason.
 MOST_FAILURES = 5
-# Penalty for never reaching the threshold: twice the budget (PAR-2). If only the steps done
-# counted, giving up early would look cheap.
-WHOLE_RUNS = 2
 # Scores from here on are the optimum, up to rounding.
 OPTIMAL_SCORE = 1 - 1e-6
 # A search ends with this many settings at the optimum on all seeds, or with as many as are
@@ -85,26 +84,26 @@ def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
     row, name = results.rows[0], tuning.figure
     if name == "score" and row.get(name) is None:  # no known optimum
         name = "final"
-    figure = _cost(name, row, results.curves) if name in COST_OF_THRESHOLD else row.get(name)
+    figure = _steps(row) if name == STEPS else row.get(name)
     if figure is None or not math.isfinite(figure):
-        hint = ": no threshold is known; give --threshold" if name in COST_OF_THRESHOLD else ""
+        hint = ": no threshold is known; give --threshold" if name == STEPS else ""
         raise UserError(f"it has no figure for {name}{hint}")
-    is_optimal = name == "score" and figure >= OPTIMAL_SCORE
-    steps = _cost("steps", row, results.curves) if is_optimal else None
+    steps = _steps(row) if name == "score" and figure >= OPTIMAL_SCORE else None
     return RunOutcome(float(figure), float(row.get("cpu_seconds") or row["seconds"]), name, steps)
 
 
-def _cost(name: str, row: Mapping[str, Any], curves: Sequence[Curve]) -> float | None:
-    """Steps or seconds until the learning curve reaches the threshold; None without one.
+def _steps(row: Mapping[str, Any]) -> float | None:
+    """Steps until the learning curve reaches the threshold; None without one.
 
-    Source: for PAR-k, Hutter et al. (2009), "ParamILS", JAIR 36.
+    A run that never reaches it counts as twice its length (PAR-2). If only the steps done counted,
+    giving up early would look cheap.
+
+    Source: Hutter et al. (2009), "ParamILS", JAIR 36.
     """
-    if (threshold := row.get("threshold")) is None:
+    if row.get("threshold") is None:
         return None
-    points = curves[0].figures["step" if name == "steps" else "seconds"]
-    reached = float(steps_to_threshold(points, curves[0].figures["value"], float(threshold)))
-    whole = float(row["n_timesteps" if name == "steps" else "seconds"])
-    return reached if math.isfinite(reached) else WHOLE_RUNS * whole
+    reached = float(row["steps_to_threshold"])
+    return reached if math.isfinite(reached) else 2.0 * row["n_timesteps"]
 
 
 def outcomes_of(trial: FrozenTrial) -> dict[int, RunOutcome]:
@@ -112,7 +111,71 @@ def outcomes_of(trial: FrozenTrial) -> dict[int, RunOutcome]:
     return {int(seed): RunOutcome(**run) for seed, run in trial.user_attrs.get(RUNS, {}).items()}
 
 
-# --- its trials -----------------------------------------------------------------------------------
+# --- hopeless trials; docs/search-spaces.md reports the savings and the errors of ending them -----
+
+Scores = Mapping[int, float]  # by seed
+Value = Callable[[Sequence[float]], float]  # of several scores
+
+# The smallest number of seeds for a test, and the level of a test that a trial is worse than the
+# best one, as in Optuna's WilcoxonPruner.
+MIN_SEEDS, P_THRESHOLD = 2, 0.1
+# With at least this number of seeds, a rank test can decide before most seeds are done.
+SEEDS_FOR_RANKS = 10
+
+
+def is_hopeless(
+    scores: Scores,
+    others: Sequence[Scores],
+    value: Value = fmean,
+    n_seeds: int | None = None,
+    ceiling: float = -math.inf,
+) -> bool:
+    """Whether to end a trial early, by its scores and those of all others; higher is better.
+
+    Args:
+        scores: the trial's scores by seed so far.
+        others: the same for ended and running trials.
+        value: the value of several scores.
+        n_seeds: number of seeds of a complete trial; None for the largest number so far.
+        ceiling: the highest possible score; by default, the highest score so far.
+    """
+    n_seeds = max(map(len, others), default=0) if n_seeds is None else n_seeds
+    # Running trials may have been lucky.
+    whole = [each for each in others if len(each) == n_seeds]
+    best = max(whole, key=lambda each: value([*each.values()]), default=None)
+    if not scores or best is None:
+        return False
+    perfect = max(ceiling, *(max(each.values()) for each in (*others, scores) if each))
+    if cannot_win(scores, best, value, n_seeds, perfect):
+        return True
+    return n_seeds >= SEEDS_FOR_RANKS and worse_by_ranks(scores, best)
+
+
+def cannot_win(scores: Scores, best: Scores, value: Value, n_seeds: int, perfect: float) -> bool:
+    """Whether the trial stays below the best one even with perfect scores on all other seeds.
+
+    If no score is above ``perfect``, this rule never ends a trial that would have been chosen.
+    """
+    if (missing := n_seeds - len(scores)) <= 0:
+        return False
+    at_most, to_beat = value([*scores.values()] + [perfect] * missing), value([*best.values()])
+    return at_most < to_beat - 1e-9 * max(1.0, abs(to_beat))
+
+
+def worse_by_ranks(scores: Scores, best: Scores) -> bool:
+    """Whether a signed-rank test on the common seeds finds the trial worse than the best one.
+
+    Source: Wilcoxon (1945); as Optuna's WilcoxonPruner.
+    """
+    from scipy.stats import wilcoxon
+
+    lead = [score - best[seed] for seed, score in scores.items() if seed in best]
+    if len(lead) < MIN_SEEDS or sum(lead) >= 0:
+        return False
+    return bool(wilcoxon(lead, alternative="less", zero_method="zsplit").pvalue < P_THRESHOLD)
+
+
+# --- the trials -----------------------------------------------------------------------------------
 
 
 @dataclass
@@ -134,7 +197,6 @@ class Search:
         root: its folder.
         study: Optuna's study.
         suggestions: the settings of its trials.
-        n_trials: the number of trials when the search is done.
         tell: called with the number of each trial that ends, its value (None if it was pruned or
             failed), and the reason of a failure.
         deadline: no run begins after this time (`time.monotonic`).
@@ -144,7 +206,7 @@ class Search:
         self, tuning: TuningSpec, root: Path, study: Study, suggestions: Suggestions
     ) -> None:
         self.tuning, self.root, self.study, self.suggestions = tuning, root, study, suggestions
-        self.n_trials = suggestions.n_trials
+        self.n_trials = tuning.n_trials
         self.tell: Callable[[int, float | None, str], None] = lambda *_: None
         self.deadline = math.inf
         self._trials: list[_UnderWay] = []
@@ -214,7 +276,8 @@ class Search:
             if all(trial.state != TrialState.WAITING for trial in trials):
                 if len(trials) == self.n_trials:
                     return None
-                self.study.enqueue_trial(self.suggestions.params(len(trials)))
+                suggestions = self.suggestions
+                self.study.enqueue_trial(suggestions.fixed if trials else suggestions.first)
             new = _UnderWay(self.study.ask())
             entry = self.suggestions.entry(new.trial)
             new.trial.set_user_attr(SETTINGS, plain(entry))
@@ -243,7 +306,7 @@ class Search:
         each.trial.set_user_attr(RUNS, {str(k): asdict(one) for k, one in each.runs.items()})
         if len(each.runs) == len(self.tuning.seeds):
             self._end(each, value)
-        elif each.trial.number and self._is_hopeless(each):
+        elif each.trial.number and self.tuning.pruner != "none" and self._is_hopeless(each):
             self._end(each, None)
 
     def _is_hopeless(self, each: _UnderWay) -> bool:
@@ -260,7 +323,6 @@ class Search:
         return is_hopeless(
             scores(each.runs),
             [scores(outcomes_of(trial)) for trial in others],
-            self.tuning.pruner,
             lambda values: sign * self.tuning.value([sign * value for value in values]),
             n_seeds=len(self.tuning.seeds),
             ceiling=1.0 if are_scores else -math.inf,
@@ -287,16 +349,11 @@ class Search:
 # --- opening it ----------------------------------------------------------------------------------
 
 
-def open_search(tuning: TuningSpec, root: Path, url: str | None = None) -> Search:
-    """Check a search, and open or create its trials.
-
-    Args:
-        tuning: the search.
-        root: its folder, which is locked by this process.
-        url: a database of trials, such as ``sqlite:///FILE``; None for one in the folder.
+def open_search(tuning: TuningSpec, root: Path) -> Search:
+    """Check a search, and open or create its trials in its folder, which this process has locked.
 
     Raises:
-        UserError: if the search cannot be done, or the storage has another one of this name.
+        UserError: if the search cannot be done, or the folder has another one.
     """
     run, agent = shipped_run(tuning, root), tuning.agent
     if tuning.figure == AUTO:
@@ -308,20 +365,18 @@ def open_search(tuning: TuningSpec, root: Path, url: str | None = None) -> Searc
         raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
     suggestions.check(root)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    with storage_errors(url or str(root / OWN_FILE)):
+    with storage_errors(root):
         study = optuna.create_study(
             study_name=tuning.study.name,
-            storage=open_storage(root, url),
+            storage=open_storage(root),
             sampler=SeededSampler(tuning),
-            pruner=optuna.pruners.NopPruner(),  # `tuning.pruning` decides
+            pruner=optuna.pruners.NopPruner(),  # `is_hopeless` decides
             direction="minimize" if tuning.is_cost else "maximize",
             load_if_exists=True,
         )
     ranges = suggestions.space.distributions
     as_json = {name: distribution_to_json(kind) for name, kind in ranges.items()}
     asked = tuning.identity(suggestions.shipped, as_json)
-    if url is not None:  # the folder's lock is the only one
-        asked["folder"] = str(root.absolute())
     before = study.user_attrs.get(ASKED, asked)
     if changed := [key for key in asked if before.get(key) != asked[key]]:
         pairs = [(key, shown(before.get(key)), shown(asked[key])) for key in changed[:3]]
@@ -335,23 +390,20 @@ def open_search(tuning: TuningSpec, root: Path, url: str | None = None) -> Searc
     return Search(tuning, root, study, suggestions)
 
 
-def open_storage(root: Path, url: str | None) -> BaseStorage:
-    """Open a storage of trials, see `open_search`."""
-    if url is not None:
-        return RDBStorage(url.replace("{", "{{").replace("}", "}}"))  # Optuna replaces braces
+def open_storage(root: Path) -> BaseStorage:
+    """Open the SQLite file of the trials in the search's folder."""
     # Opened by path, because in a URL some characters have another meaning.
-    path = root / OWN_FILE
-    connect = partial(sqlite3.connect, path, SECONDS_TO_WAIT, check_same_thread=False)
+    connect = partial(sqlite3.connect, root / OWN_FILE, SECONDS_TO_WAIT, check_same_thread=False)
     return RDBStorage(f"sqlite:///{OWN_FILE}", engine_kwargs={"creator": connect})
 
 
 @contextmanager
-def storage_errors(name: str) -> Iterator[None]:
-    """Tell a failure of the storage in one line: it is full, damaged, or cannot be reached."""
+def storage_errors(root: Path) -> Iterator[None]:
+    """Tell a failure of the storage in one line: the disk is full, or the file is damaged."""
     try:
         yield
-    except (SQLAlchemyError, StorageInternalError, ImportError) as error:  # or has no driver here
+    except (SQLAlchemyError, StorageInternalError) as error:
         cause: BaseException = error
         while cause.__cause__ is not None:  # the database's own words
             cause = cause.__cause__
-        raise UserError(f"{without_secret(name)}: {one_line(cause)}") from error
+        raise UserError(f"{root / OWN_FILE}: {one_line(cause)}") from error

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +16,9 @@ from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import plain
 
 Floats = NDArray[np.float64]
-Sampler = Literal["tpe", "gp", "random", "grid"]
-Objective = Literal["mean", "iqm", "lower"]
-SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
-OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
-
-# The figure of a run: a metric of compare.py, the score, or the cost to reach the threshold.
-COST_OF_THRESHOLD = ("steps", "seconds")
-FIGURES = ("score", *METRICS, *COST_OF_THRESHOLD)
-CHEAPER_IS_BETTER = (*COSTS, *COST_OF_THRESHOLD)
-
+SAMPLERS, PRUNERS, OBJECTIVES = ("tpe", "random"), ("auto", "none"), ("mean", "iqm", "lower")
+STEPS = "steps"  # of training until the learning curve reaches the threshold
+FIGURES = ("score", *METRICS, STEPS)  # of a run
 AUTO, SHIPPED = "auto", "shipped"
 # What may differ when a search continues: its length, and all about the re-test.
 _MAY_CHANGE = {"study", "n_trials", "retest", "retest_seeds", "first_retest_seed", "until_decided"}
@@ -43,9 +35,9 @@ class TuningSpec:
     study: StudySpec
     n_trials: int = 100  #: number of settings to try
     figure: str = AUTO  #: one of `FIGURES`; or `AUTO`, until the kind of runs is known
-    objective: Objective = "mean"  #: the value of a setting over its seeds, see `value`
-    sampler: Sampler = "tpe"  #: the sampler of settings
-    pruner: str = "auto"  #: the rule that ends trials early
+    objective: str = "mean"  #: the value of a setting over its seeds, see `value`
+    sampler: str = "tpe"  #: the sampler of settings
+    pruner: str = "auto"  #: "auto": trials end early by `searching.is_hopeless`; or "none"
     n_startup_trials: int = 10  #: random trials before the sampler learns
     seed: int = 0  #: seed of the sampler, and of the order of seeds
     search_space: Path | None = None  #: a file with the space; None for the agent's own
@@ -68,12 +60,12 @@ class TuningSpec:
     @property
     def is_cost(self) -> bool:
         """Whether a lower figure is better."""
-        return self.figure in CHEAPER_IS_BETTER
+        return self.figure in (*COSTS, STEPS)
 
     @property
     def is_judged_by_study(self) -> bool:
         """Whether the verdicts of a study are about the figure and statistic of the search."""
-        return self.objective == "mean" and self.figure not in COST_OF_THRESHOLD
+        return self.objective == "mean" and self.figure != STEPS
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -104,7 +96,7 @@ class TuningSpec:
 
     def check(self) -> None:
         """Check that search and re-test share no seeds, and that a re-test can grow."""
-        from rl_yardstick.experiments.growing import MOST_SEEDS
+        from rl_yardstick.experiments.plan import MOST_SEEDS
 
         most = least = self.retest_seeds
         if self.until_decided:
@@ -141,8 +133,3 @@ class TuningSpec:
             "search_space": dict(space),
         }
         return dict(plain(found))
-
-
-def without_secret(text: str) -> str:
-    """The text without the passwords in its URLs."""
-    return re.sub(r"(?<=://)([^\s/@:]*):[^\s/@]*@", r"\1:***@", text)

@@ -1,18 +1,12 @@
 """Studies that get more seeds until they are decided, and their planned looks."""
 
+from dataclasses import replace
+
 import pandas as pd
 import pytest
 
-from rl_yardstick.experiments.analysis import analyse
-from rl_yardstick.experiments.growing import (
-    first_counts,
-    grown,
-    look_sizes,
-    looked,
-    next_counts,
-    plan_of_looks,
-)
-from rl_yardstick.experiments.plan import StudyRecord, plan
+from rl_yardstick.experiments.analysis import analyse, looked
+from rl_yardstick.experiments.plan import StudyRecord, look_sizes, plan, plan_of_looks
 from rl_yardstick.experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline.errors import UserError
@@ -46,11 +40,21 @@ def results_of(study, root, ends=ENDS, counts=None):
     return StudyResults(study, root, *tables, tuple(planned))
 
 
+def grown(study, counts):
+    """The study with the largest number of seeds of any agent."""
+    return replace(study, n_seeds=max(counts.values()))
+
+
+def next_counts(said):
+    """The numbers of seeds at the next look."""
+    return {(agent, e): n for e, by in said.seeds.items() for agent, n in by.items()}
+
+
 def grow(study, root, most=None, steps=99, ends=ENDS):
     """What the command does, with made-up runs; the verdicts after each look."""
     looks = plan_of_looks(study, root, most)
     StudyRecord(study, {}, looks).write(root)
-    counts, found = first_counts(study), []
+    counts, found = {(agent.label, "lake"): study.n_seeds for agent in study.agents}, []
     for _ in range(steps):
         now = results_of(grown(study, counts), root, ends, counts)
         found.append(looked(now, looks))

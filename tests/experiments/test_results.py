@@ -234,8 +234,8 @@ def test_ranks_estimates_and_pairs(tmp_path):
     assert (environment.optimum, environment.baseline, environment.exact) == (100, 0, True)
     assert environment.margin == 0.02
     best = environment.agents[0]
-    figures = [best.metric.mean, best.score, best.area, best.success_rate, best.seconds]
-    assert [figure.point for figure in figures] == pytest.approx([91, 0.91, 0.75 * 91, 1, 2.5])
+    figures = [best.metric.mean, best.score, best.success_rate, best.seconds]
+    assert [figure.point for figure in figures] == pytest.approx([91, 0.91, 1, 2.5])
     others = best.stochastic.point, best.discounted.point
     assert others == pytest.approx((86, 45.5))
     assert (best.acts_by, best.discount, best.discounted_optimum) == ("epsilon 0.1", 0.9, 50)

@@ -45,33 +45,32 @@ def read(tmp_path):
 BASE = "agents: [qlearning]\nenvironments: [FrozenLake-v1]\n"
 TAXI = "environments: [Taxi-v4]\n"
 
-# The text, the line that is named, and what is said of it.
+# The text, and what is said of it.
 MISTAKES = [
-    ("", 1, "a study must map names to values"),
-    (BASE + "seed: 3\n", 3, "unknown key 'seed': did you mean 'seeds'?"),
-    (BASE + "\nseeds: many\n", 4, "seeds must be a valid integer, not 'many'"),
-    (BASE + "seeds: true\n", 3, "seeds must be a number, not True"),
-    (BASE + "seeds:\n  first: -1\n", 4, "first must be greater than or equal to 0, not -1"),
-    (BASE + "metric: finl\n", 3, "did you mean 'final'?"),
-    (BASE + "run_timeout: -1\n", 3, "run_timeout must be a time"),
-    (BASE + "quick:\n  budget: 0\n", 4, "budget must be greater than 0"),
-    (BASE + "quick:\n  sed: 0\n", 4, "unknown key 'sed': did you mean 'seeds'?"),
-    (BASE + "n_timesteps: 5\nn_episodes: 5\n", 4, "give n_timesteps or n_episodes, not both"),
-    (BASE + "sweep:\n  gamma: []\n", 4, "gamma must have at least 1 item"),
-    ("agents: [dqn]\n", 1, "environments must list at least one name"),
-    (TAXI + "agents: [dqn, dqn]\n", 2, "agents names one of them twice"),
-    (TAXI + "agents: [sarsa, qlerning]\n", 2, "'qlerning': did you mean 'qlearning'?"),
-    (TAXI + "agents:\n  dqn:\n    conf_file: no.yml\n", 4, "conf_file: there is no file "),
-    ("agents: [dqn]\nenvironments: {ice: {id: FrozenLak-v1}}\n", 2, "mean 'FrozenLake-v1'"),
+    ("", "a study must map names to values"),
+    (BASE + "seed: 3\n", "unknown key 'seed': did you mean 'seeds'?"),
+    (BASE + "\nseeds: many\n", "seeds: count must be a valid integer, not 'many'"),
+    (BASE + "seeds: true\n", "seeds: count must be a number, not True"),
+    (BASE + "seeds:\n  first: -1\n", "seeds: first must be greater than or equal to 0, not -1"),
+    (BASE + "metric: finl\n", "did you mean 'final'?"),
+    (BASE + "run_timeout: -1\n", "run_timeout must be a time"),
+    (BASE + "quick:\n  budget: 0\n", "quick: budget must be greater than 0"),
+    (BASE + "quick:\n  sed: 0\n", "quick: unknown key 'sed': did you mean 'seeds'?"),
+    (BASE + "sweep:\n  gamma: []\n", "sweep: gamma must have at least 1 item"),
+    ("agents: [dqn]\n", "environments must list at least one name"),
+    (TAXI + "agents: [dqn, dqn]\n", "agents names one of them twice"),
+    (TAXI + "agents: [sarsa, qlerning]\n", "'qlerning': did you mean 'qlearning'?"),
+    (TAXI + "agents:\n  dqn:\n    conf_file: no.yml\n", "dqn: conf_file: there is no file "),
+    ("agents: [dqn]\nenvironments: {ice: {id: FrozenLak-v1}}\n", "mean 'FrozenLake-v1'"),
 ]
 
 
-@pytest.mark.parametrize(("text", "line", "complaint"), MISTAKES)
-def test_a_mistake_is_one_line_with_file_and_line(read, text, line, complaint):
+@pytest.mark.parametrize(("text", "complaint"), MISTAKES)
+def test_a_mistake_is_one_line_with_the_file(read, text, complaint):
     with pytest.raises(UserError) as error:
         read(text)
     message = str(error.value)
-    assert re.match(rf".*lakes\.yml:{line}:", message)
+    assert re.match(r".*lakes\.yml: ", message)
     assert complaint in message
 
 
@@ -114,7 +113,7 @@ def test_agents_and_environments(read):
     assert (slow.label, slow.algo, slow.tuned) == ("slow", "qlearning", False)
     assert (slow.summary, slow.settings) == ("creeps", {"learning_rate": 0.01})
     assert (sarsa.algo, sarsa.tuned) == ("sarsa", True)
-    assert slow.where.endswith("lakes.yml:8")
+    assert slow.where.endswith("lakes.yml")
     small, dry = study.environments
     usual = {"n_timesteps": 500, "gamma": 0.9, "env_kwargs": {"map_name": "4x4"}}
     assert (small.env_id, small.settings) == ("FrozenLake-v1", usual)
@@ -141,7 +140,7 @@ def test_an_agent_has_a_file_of_settings_beside_the_study(read, tmp_path):
 # --- Sweeps.
 
 
-def test_sweeps_multiply_and_are_counted_before_they_are_made(read):
+def test_sweeps_multiply(read):
     study = read(
         TAXI + "sweep: {gamma: [0.9, 0.99], learning_rate: [0.1, 0.5]}\n"
         "agents:\n  qlearning:\n  sarsa:\n    sweep: {gamma: [0.5]}\n"
@@ -151,9 +150,6 @@ def test_sweeps_multiply_and_are_counted_before_they_are_made(read):
         *(f"sarsa with γ = 0.5 with α = {a}" for a in (0.1, 0.5)),
     ]
     assert study.agents[2].settings == {"gamma": 0.99, "learning_rate": 0.1}
-    sweep = ", ".join(f"{name}: {list(range(100))}" for name in "abcdef")
-    with pytest.raises(UserError, match=r":4: 1,000,000,000,001 agents up to here; .* 10,000 at"):
-        read(f"{TAXI}agents:\n  sarsa:\n  qlearning:\n    sweep: {{{sweep}}}\n")
 
 
 # --- Names and files.
@@ -226,16 +222,6 @@ def test_every_agent_on_every_environment_with_every_seed(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_study_has_a_bearable_number_of_runs():
-    study = study_of("qlearning", "sarsa", "dqn", environments=(LAKE, DRY), n_seeds=10**12)
-    told = (
-        "^lakes: 3 agents on 2 environments with 1,000,000,000,000 seeds are "
-        "6,000,000,000,000 runs; a study has .* at most$"
-    )
-    with pytest.raises(UserError, match=told):
-        plan(study, NOWHERE)
-
-
 def test_labels_that_would_share_a_folder():
     for labels in (("a b", "a/b"), ("Mine", "mine"), ("same", "same")):
         agents = [AgentSpec(label, "qlearning") for label in labels]
@@ -265,6 +251,7 @@ def test_the_agents_settings_go_over_the_environments_and_those_over_the_file():
 
 UNTRAINABLE = [
     ("qlearning", {"n_timesteps": None}, "no budget"),
+    ("qlearning", {"n_timesteps": 5, "n_episodes": 5}, "give n_timesteps or n_episodes, not both"),
     ("linucb", {}, "does not fit FrozenLake-v1"),
     ("qlearning", {"env_kwargs": {"slipery": True}}, "slipery"),
     ("qlearning", {"learning_rat": 0.1}, r"did you mean 'learning_rate'\?"),
@@ -274,8 +261,8 @@ UNTRAINABLE = [
 
 @pytest.mark.parametrize(("algo", "settings", "complaint"), UNTRAINABLE)
 def test_what_cannot_be_trained_is_refused_beforehand(tmp_path, algo, settings, complaint):
-    agents = AgentSpec("good", "sarsa"), AgentSpec("bad", algo, settings, where="lakes.yml:7")
-    with pytest.raises(UserError, match=rf"^lakes\.yml:7: bad on FrozenLake-v1: .*{complaint}"):
+    agents = AgentSpec("good", "sarsa"), AgentSpec("bad", algo, settings, where="lakes.yml")
+    with pytest.raises(UserError, match=rf"^lakes\.yml: bad on FrozenLake-v1: .*{complaint}"):
         plan(study_of(*agents, n_seeds=2), tmp_path)
     assert list(tmp_path.iterdir()) == []
 

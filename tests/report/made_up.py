@@ -27,7 +27,6 @@ def agent(label, mean, **changes):
     ends = (0.0, 1.0)
     figures = AgentAnalysis(
         agent=label,
-        algo="qlearning",
         runs=AgentRuns("lake", label, 4, 0, mean / 100, ends, mean / 100, 0, ends, 0.5),
         judged=estimate(mean / 100),
         spread=0.0,
@@ -36,7 +35,6 @@ def agent(label, mean, **changes):
         metric=Summary(estimate(mean), estimate(mean + 1), mean + 2),
         score=estimate(mean / 100),
         final=estimate(mean + 3),
-        area=estimate(mean + 4),
         last_episodes=estimate(mean + 5),
         regret=estimate(mean + 6),
         steps_to_threshold=ThresholdSummary(estimate(mean + 7), share),
@@ -101,7 +99,7 @@ def analysis(environments, labels, root=None, pulls=None, overall=None, cpu=(), 
 def pulls(start, n=(1, 10, 100), n_runs=4):
     """What a bandit's agent did: figures that begin with ``start``, each ten above the last."""
     rise, nothing = start + np.arange(float(len(n))), np.empty(0)
-    unknown = ("shares", "context_regret", "estimates", "estimates_std", "true_means", "posteriors")
+    unknown = ("shares", "estimates", "estimates_std", "true_means", "posteriors")
     return PullStatistics(
         pulls=np.array(n),
         reward=rise,

@@ -76,7 +76,7 @@ def test_mean_curves_the_best_agent_first(lake):
     assert list(curves["training"].by_axis["step"]) == ["b"]
     # Each kind has a scale of its own; that of the other is the optimum.
     assert (curves["evaluation"].linear_up_to, curves["training"].linear_up_to) == (None, 100)
-    variant = replace(lake[1], agents=(made_up.agent("b", 90.0, on_variant=True),))
+    variant = replace(lake[1], agents=(made_up.agent("b", 90.0, changes=("random starts",)),))
     found = learning_curves(lake[0], variant)
     assert (found["evaluation"].on_variant, found["training"].on_variant) == ((), ("b",))
 

@@ -64,10 +64,10 @@ class Toy:
         given = {"n_trials": 10, "figure": "score", "n_startup_trials": 4, "pruner": "none"}
         return TuningSpec(study, **{**given, "search_space": self.folder / "space.yml", **changes})
 
-    def opened(self, tuning=None, name="it", storage=None):
+    def opened(self, tuning=None, name="it"):
         root = self.folder / name
         root.mkdir(exist_ok=True)
-        return open_search(tuning or self.tuning(), root, storage)
+        return open_search(tuning or self.tuning(), root)
 
     def search(self, search, n_workers=1, stops_after=None, failing=lambda run: False, **options):
         """Do the runs, until the process is killed; returns those that were done."""
@@ -97,8 +97,8 @@ class Toy:
         finished = self.finished.setdefault(root, set())
         return [ToyRun(entry, s, f"{name_of(entry)}/{s}", finished) for s in tuning.seeds]
 
-    def _storage(self, root, given):
-        return self.storages.setdefault(given or root, InMemoryStorage())
+    def _storage(self, root):
+        return self.storages.setdefault(root, InMemoryStorage())
 
     def _outcome(self, run):
         value = self.score(run.entry, run.seed)

@@ -9,20 +9,17 @@ import pandas as pd
 import pytest
 from optuna.trial import create_trial
 
-from rl_yardstick.experiments.analysis import analyse
-from rl_yardstick.experiments.growing import looked
+from rl_yardstick.experiments.analysis import analyse, looked
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.results import (
     CURVE_COLUMNS,
     RUN_COLUMNS,
-    Curve,
     RunResults,
     StudyResults,
 )
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.settings import read_entry, seeds_tuned_on
 from rl_yardstick.tuning import retesting, searching
-from rl_yardstick.tuning.pruning import PRUNERS, is_hopeless
 from rl_yardstick.tuning.retesting import (
     Outcome,
     Retested,
@@ -40,12 +37,12 @@ from rl_yardstick.tuning.searching import (
     RUNS,
     SETTINGS,
     RunOutcome,
+    is_hopeless,
     open_storage,
     outcome_of,
     outcomes_of,
 )
-from rl_yardstick.tuning.tuning_spec import without_secret
-from rl_yardstick.verdicts import Estimate
+from rl_yardstick.verdicts import Estimate, steps_to_threshold
 
 REAL_OUTCOME_OF, REAL_STORAGE = outcome_of, open_storage
 
@@ -68,22 +65,20 @@ def test_each_trial_is_the_mean_of_its_seeds_and_the_first_has_the_shipped_setti
     assert search.trials[0].user_attrs[SETTINGS] == toy.shipped
 
 
-@pytest.mark.parametrize(("sampler", "stops_after"), [("tpe", 29), ("gp", 14)])
-def test_what_was_broken_off_goes_on_to_the_same_trials(toy, sampler, stops_after):
-    tuning = toy.tuning(sampler=sampler)
-    whole = toy.opened(tuning, "whole")
+def test_what_was_broken_off_goes_on_to_the_same_trials(toy):
+    whole = toy.opened(name="whole")
     toy.search(whole)
-    first = toy.opened(tuning, "broken")
-    toy.search(first, stops_after=stops_after)
+    first = toy.opened(name="broken")
+    toy.search(first, stops_after=29)
     assert states(first)[-1] == "RUNNING"
-    again = toy.opened(tuning, "broken")
-    assert len(toy.search(again)) == 30 - stops_after
+    again = toy.opened(name="broken")
+    assert len(toy.search(again)) == 1
     assert states(again) == ["COMPLETE"] * 10
     assert params(again) == params(whole)
 
 
 def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy):
-    search = toy.opened(toy.tuning(pruner="median", n_trials=20, n_seeds=5))
+    search = toy.opened(toy.tuning(pruner="auto", n_trials=20, n_seeds=5))
     done = toy.search(search)
     ended = [trial for trial in search.trials if trial.state.name == "PRUNED"]
     assert ended
@@ -119,9 +114,6 @@ def test_another_search_of_the_same_name_is_not_continued(toy):
     toy.opened()
     with pytest.raises(UserError, match=r"toy: the search there is another .*objective: 'mean'"):
         toy.opened(toy.tuning(objective="lower"))
-    toy.opened(name="one", storage="shared")
-    with pytest.raises(UserError, match=r"toy: the search there is another \(folder: "):
-        toy.opened(name="two", storage="shared")
 
 
 def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy):
@@ -162,45 +154,18 @@ def test_what_the_user_fixes_is_not_searched(toy):
     assert len({p["learning_rate"] for p in params(search)}) == 10
 
 
-def test_a_grid_goes_through_every_point_once(toy):
-    search = toy.opened(toy.tuning(sampler="grid", n_trials=12, figure="steps"))
-    toy.search(search, score=lambda entry, seed: 100.0 * entry["gamma"])
-    tried = {(p["learning_rate"], p["gamma"]) for p in params(search)[1:]}
-    assert len(params(search)) == 10  # three values of each, and what was shipped
-    assert len(tried) == 9
-    assert {gamma for _, gamma in tried} == {0.5, 0.75, 1.0}
-    assert search.study.best_value == 50.0  # a cost is made small
-    with pytest.raises(UserError, match="4 settings with two values of each number"):
-        toy.search(toy.opened(toy.tuning(sampler="grid", n_trials=4), "too few"))
-
-
 # --- where trials are stored ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("given", [None, "sqlite:///{}/db"])
-def test_a_storage_of_any_kind_keeps_the_search(toy, monkeypatch, given):
+def test_the_storage_keeps_the_search(toy, monkeypatch):
     monkeypatch.setattr(searching, "open_storage", REAL_STORAGE)
-    given, tuning = given and given.format(toy.folder), toy.tuning(n_trials=2, n_seeds=1)
-    search = toy.opened(tuning, "a {b} %20 c?d", given)
+    tuning = toy.tuning(n_trials=2, n_seeds=1)
+    search = toy.opened(tuning, "a {b} %20 c?d")
     toy.search(search)
-    assert params(toy.opened(tuning, "a {b} %20 c?d", given)) == params(search)
-    if given is None:
-        (search.root / "trials.db").write_bytes(b"no database any more" * 100)
-        with pytest.raises(UserError, match=r"trials\.db: file is not a database$"):
-            toy.opened(tuning, "a {b} %20 c?d")
-
-
-def test_a_storage_that_cannot_be_opened_is_one_line_without_its_password(toy, monkeypatch):
-    monkeypatch.setattr(searching, "open_storage", REAL_STORAGE)
-    for given, said in [
-        ("nothing://u:se%40cret@127.0.0.1:1/db", r"^nothing://u:\*\*\*@127\.0\.0\.1:1/db: "),
-        ("notes.txt", r"notes\.txt: Could not parse"),
-    ]:
-        with pytest.raises(UserError, match=said) as error:
-            toy.opened(storage=given)
-        assert "cret" not in str(error.value)
-    line = "tune.py --storage postgresql://u:se%40cret@h/db -j 2"
-    assert without_secret(line) == line.replace("se%40cret", "***")
+    assert params(toy.opened(tuning, "a {b} %20 c?d")) == params(search)
+    (search.root / "trials.db").write_bytes(b"no database any more" * 100)
+    with pytest.raises(UserError, match=r"trials\.db: file is not a database$"):
+        toy.opened(tuning, "a {b} %20 c?d")
 
 
 # --- what a run and a setting are worth, worked out by hand ---------------------------------------
@@ -222,10 +187,9 @@ def test_values_of_a_setting_by_hand(toy, objective, figure, value):
 
 
 def outcome(toy, monkeypatch, figure, **row):
-    figures = {"step": [10, 20, 30], "seconds": [0.5, 1.0, 1.5], "value": [0.0, 0.6, 0.4]}
-    evaluations = Curve({}, {name: np.array(values) for name, values in figures.items()})
     row = {"seconds": 2.0, "n_timesteps": 30, "threshold": 0.5, **row}
-    results = RunResults([row], [evaluations])
+    row["steps_to_threshold"] = steps_to_threshold([10, 20, 30], [0.0, 0.6, 0.4], row["threshold"])
+    results = RunResults([row])
     monkeypatch.setattr(searching, "read_run", lambda *_: results)
     return REAL_OUTCOME_OF(toy.tuning(figure=figure), None)
 
@@ -237,9 +201,7 @@ FIGURES_OF_RUNS = [
     ("final", {"score": 0.7, "final": 5.0}, 5.0, None),
     ("regret", {"regret": 12.0}, 12.0, None),
     ("steps", {}, 20.0, None),
-    ("seconds", {}, 1.0, None),
     ("steps", {"threshold": 0.9}, 60.0, None),  # never: two whole runs
-    ("seconds", {"threshold": 0.9}, 4.0, None),
     # Only an optimal score has steps.
     ("score", {"score": 1.0}, 1.0, 20.0),
     ("score", {"score": 1 - 1e-8, "threshold": 0.9}, 1 - 1e-8, 60.0),
@@ -259,61 +221,47 @@ def scored(scores, first=0):
     return {first + number: score for number, score in enumerate(scores)}
 
 
-@pytest.mark.parametrize("method", PRUNERS)
-def test_the_first_trial_and_the_best_one_go_on_and_the_worst_of_many_does_not(method):
-    assert not is_hopeless({}, [], method)
-    assert not is_hopeless(scored([0.1, 0.1]), [], method)
+def test_the_first_trial_and_the_best_one_go_on_and_the_worst_of_many_does_not():
+    assert not is_hopeless({}, [])
+    assert not is_hopeless(scored([0.1, 0.1]), [])
     others = [scored([0.1 * n] * 12) for n in range(8)]
-    assert not any(is_hopeless(scored([0.8] * n), others, method) for n in range(1, 12))
+    assert not any(is_hopeless(scored([0.8] * n), others) for n in range(1, 12))
     better = [scored([0.5 + 0.05 * n] * 12) for n in range(8)]
-    ended = [is_hopeless(scored([0.0] * n), better, method) for n in range(1, 12)]
-    assert any(ended) is (method != "none")
+    assert any(is_hopeless(scored([0.0] * n), better) for n in range(1, 12))
 
 
 TWO = [[0.9, 0.9, 1.0], [1.0, 0.2]]
 FAILED = [[0.9, 0.9, 0.9], [1.0, 0.1]]
 SHORT = [[0.9, 0.9]]
-# Their means are 0.5, 0.4, 0.6 and 0.8, the median of which is 0.55.
-FOUR = [[0.0, 1.0], [0.2, 0.6], [0.6, 0.6], [0.8, 0.8]]
-FIVE = [[0.1 * n] for n in range(1, 6)]
-WHOLE = [[0.1 * n] * 3 for n in range(1, 6)]
 # A score of 10 has been seen: with that, any trial could still win.
 NINE, TEN = ([[0.5] * n, [10.0]] for n in (9, 10))
 WORSE = [0.4, 0.39, 0.38, 0.37]
 
 
 @pytest.mark.parametrize(
-    ("method", "scores", "others", "options", "hopeless"),
+    ("scores", "others", "options", "hopeless"),
     [
         # What is left counts as perfect: 0.9 and twice 1.0 is more than 2.8, with 0.8 it is a draw.
-        ("bound", [0.8], TWO, {}, False),
-        ("bound", [1.0, 0.79], TWO, {}, True),
+        ([0.8], TWO, {}, False),
+        ([1.0, 0.79], TWO, {}, True),
         # A trial under way is no measure.
-        ("bound", [0.1], SHORT, {}, True),
-        ("bound", [0.1], SHORT, {"n_seeds": 3}, False),
+        ([0.1], SHORT, {}, True),
+        ([0.1], SHORT, {"n_seeds": 3}, False),
         # Perfect is the highest score that any trial has had.
-        ("bound", [-115.0], [[-110.0, -110.0], [-100.0, -200.0]], {}, False),
+        ([-115.0], [[-110.0, -110.0], [-100.0, -200.0]], {}, False),
         # Where the optimum is known nothing less is.
-        ("bound", [0.6], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, False),
-        ("bound", [0.05], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, True),
+        ([0.6], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, False),
+        ([0.05], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, True),
         # One failed seed of three sinks a mean, and no median.
-        ("bound", [0.1], FAILED, {"value": statistics.median}, False),
-        ("bound", [0.1, 0.1], FAILED, {"value": statistics.median}, True),
-        # Nothing is concluded from one seed, or from three others.
-        ("median", [0.5, 0.5], FOUR, {}, True),
-        ("median", [0.6, 0.5], FOUR, {}, False),
-        ("median", [0.0, 0.0], FOUR[1:], {}, False),
-        # Of six, two go on; two seeds are between the rungs.
-        ("halving", [0.45], FIVE, {}, False),
-        ("halving", [0.35], FIVE, {}, True),
-        ("halving", [0.0, 0.0, 0.0], [*WHOLE, [1.0] * 9], {}, True),
-        # The default takes ranks from ten seeds on.
-        ("auto", WORSE, NINE, {}, False),
-        ("auto", WORSE, TEN, {}, True),
+        ([0.1], FAILED, {"value": statistics.median}, False),
+        ([0.1, 0.1], FAILED, {"value": statistics.median}, True),
+        # Ranks decide from ten seeds on.
+        (WORSE, NINE, {}, False),
+        (WORSE, TEN, {}, True),
     ],
 )
-def test_what_is_hopeless(method, scores, others, options, hopeless):
-    found = is_hopeless(scored(scores), [scored(each) for each in others], method, **options)
+def test_what_is_hopeless(scores, others, options, hopeless):
+    found = is_hopeless(scored(scores), [scored(each) for each in others], **options)
     assert found is hopeless
 
 
@@ -495,7 +443,6 @@ def test_a_re_test_has_grown_enough_when_its_best_setting_is_decided(
         # Both reach the optimum, one of them sooner.
         ({"figure": "steps"}, [(1.0, 900.0 + k) for k in range(20)], [(1.0, 500.0)] * 20, "better"),
         ({"figure": "steps"}, [(1.0, 5.0)] * 20, [(1.0, 4.0)] * 6 + [(1.0, 9.0)] * 14, "worse"),
-        ({"figure": "seconds"}, [(1.0, 5.0)] * 4, [(1.0, 1.0)] * 4, "better so far"),
     ],
 )
 def test_the_verdict_is_about_what_was_searched_for(
