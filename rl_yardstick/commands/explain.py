@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    from rl_yardstick.diagnosis.explanation import Explanation, Side
+    from rl_yardstick.diagnosis.explanation import Explanation
     from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
     from rl_yardstick.pipeline.models import Model, Wanted
 
@@ -25,8 +25,6 @@ examples:
   python -m rl_yardstick explain --env FrozenLake-v1 --algo qlearning
   python -m rl_yardstick explain logs/dqn/Taxi-v4_1 --json why.json
   python -m rl_yardstick explain logs/my_study --algo dqn --env Taxi-v4     # its median run
-  python -m rl_yardstick explain logs/sarsa/CliffWalking-v1_1 \\
-    --against logs/qlearning/CliffWalking-v1_1
 """
 
 
@@ -41,8 +39,6 @@ def build_parser() -> argparse.ArgumentParser:
     test = "train four seeds with this change (KEY:VALUE ...), with the shipped settings and as it "
     test += "is; repeat the flag to try several changes; without a change, try the proposed ones"
     add("--test", nargs="*", action="append", metavar="KEY:VALUE", help=test)
-    other = "another agent on the same environment: where the two first differ, and what it costs"
-    add("--against", type=Path, metavar="MODEL", help=other)
     add("--map", type=Path, metavar="FILE", help="draw the cost of each cell, as .png")
     add("--course", action="store_true", help="also split the gap of each checkpoint of the run")
     add("--json", type=filled, metavar="FILE", help="also write the explanation to this file")
@@ -55,7 +51,7 @@ def main() -> int:
     """Explain an agent."""
     args = build_parser().parse_args()
     from rl_yardstick.commands.terminal import TextConsole, say
-    from rl_yardstick.report.why import as_words, course_lines, parting_lines, why_lines
+    from rl_yardstick.report.why import as_words, course_lines, why_lines
 
     def tell(lines: list[str]) -> None:
         for line in lines:
@@ -69,15 +65,6 @@ def main() -> int:
         likeliest = ", ".join(f"--test {as_words(one)}" for one in explained.proposals[:2])
         say(console, f"to see what helps: {likeliest}, or --test alone")
     data = explained.as_data()
-    if args.against is not None:
-        from rl_yardstick.diagnosis.explanation import parting
-
-        other = asked(console, replace(wanted, path=args.against, algo=None, env_id=None))
-        if one.evaluator.model.prob.shape != other.evaluator.model.prob.shape:
-            raise UserError("--against: the two agents do not act on the same environment")
-        found = parting(one.side, other.side)
-        tell(parting_lines(found))
-        data["against"] = found.as_data()
     if args.course:
         course = course_of(one, explained)
         tell(course_lines(course))
@@ -102,16 +89,11 @@ class Asked:
     evaluator: ExactEvaluator
     agent: BaseAlgorithm
 
-    @property
-    def side(self) -> Side:
-        """What `parting` compares."""
-        return self.found.spec, self.agent, self.evaluator
-
     def explanation(self) -> Explanation:
         """Where the agent loses return against the optimum."""
         from rl_yardstick.diagnosis.explanation import explanation
 
-        return explanation(*self.side)
+        return explanation(self.found.spec, self.agent, self.evaluator)
 
 
 def asked(console: Console, wanted: Wanted) -> Asked:

@@ -45,7 +45,7 @@ from rl_yardstick.mdp import (
 )
 from rl_yardstick.mdp.advantages import expected_next
 from rl_yardstick.mdp.evaluation import canonical_policy, policy_matrix
-from rl_yardstick.mdp.gaps import GapByState, first_differences, gap_by_state, greedy_repairs
+from rl_yardstick.mdp.gaps import GapByState, gap_by_state, greedy_repairs
 from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.environments import make_single_env
@@ -245,7 +245,9 @@ class Found:
     ) -> None:
         self.evaluator, self.split, self.task, self.policy = evaluator, split, task, policy
         self.model, self.horizon, self.agent = evaluator.model, evaluator.horizon, agent
-        self.taken = _first_actions(self.model, policy)
+        # the likeliest action at the first step, shape (S,)
+        chances = policy_matrix(self.model, canonical_policy(self.model, policy))
+        self.taken: Ints = chances.argmax(axis=1)
         self.groups = None
         if evaluator.scale is not None:
             self.groups = observation_groups(evaluator.observations, self.model.reachable)
@@ -435,75 +437,6 @@ class Found:
             f"on the best road of {len(road)} states it reaches the end from {n_sure}; its last "
             f"wrong turn is at {names[0](last)}: {does}, where {best} is best"
         )
-
-
-# --- two agents -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Place:
-    """A state in which two agents first act differently."""
-
-    state: int
-    name: str
-    met: float  #: the probability that an episode's first difference is there
-    gain: float  #: what the better agent gains by it, in return per episode
-    actions: tuple[str, str]  #: the actions of the better and of the worse agent
-
-
-@dataclass(frozen=True)
-class Parting:
-    """Where the policies of two agents first part, the one with the higher return first."""
-
-    names: tuple[str, str]
-    difference: float  #: the difference of the returns, at least 0; gains sum to it
-    met: float  #: the probability that an episode has a difference
-    places: tuple[Place, ...]  #: at most 20, the largest gains or losses first
-
-    def as_data(self) -> dict[str, Any]:
-        """The parting as JSON."""
-        return {**vars(self), "places": [vars(place) for place in self.places]}
-
-
-Side = tuple[TrainSpec, BaseAlgorithm, ExactEvaluator]
-
-
-def parting(one: Side, other: Side) -> Parting:
-    """Where the policies of two agents on one environment first part, and the cost of it.
-
-    Raises:
-        UserError: where a policy cannot be evaluated in all states, or the model is too large.
-    """
-    evaluator = one[2]
-    model, horizon = evaluator.model, evaluator.horizon
-    policies = []
-    for spec, agent, of in (one, other):
-        if reason := of.obstacle(agent):
-            raise UserError(f"{spec.algo} cannot be compared: {reason}")
-        policies.append(of.policy(agent, deterministic=True))
-    returns = [policy_return(model, policy, horizon).expected_return for policy in policies]
-    names = [spec.algo for spec, _, _ in (one, other)]
-    if names[0] == names[1]:
-        names = [f"{name} {number}" for number, name in enumerate(names, 1)]
-    better, worse = (0, 1) if returns[0] >= returns[1] else (1, 0)
-    try:
-        found = first_differences(model, policies[better], policies[worse], horizon)
-    except ValueError as error:
-        raise UserError(f"{one[0].env_id}: {error}") from error
-    first, second = (_first_actions(model, policies[side]) for side in (better, worse))
-    places, order = [], np.argsort(-np.abs(found.gains), kind="stable")[:20]
-    with closing(make_single_env(one[0])) as env:
-        place, actions = _names(env, evaluator)
-        for state in order[found.met[order] > 0].tolist():
-            done, met = (actions[first[state]], actions[second[state]]), float(found.met[state])
-            places.append(Place(state, place(state), met, float(found.gains[state]), done))
-    difference = returns[better] - returns[worse]
-    return Parting((names[better], names[worse]), difference, float(found.met.sum()), tuple(places))
-
-
-def _first_actions(model: TransitionModel, policy: NDArray[Any]) -> Ints:
-    """The likeliest action of a policy at the first step, shape (S,)."""
-    return np.asarray(policy_matrix(model, canonical_policy(model, policy)).argmax(axis=1))
 
 
 def _noisy(model: TransitionModel, epsilon: float) -> TransitionModel:

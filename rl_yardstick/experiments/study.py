@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.pipeline.arguments import arguments_of
+from rl_yardstick.pipeline.components import arguments_of
 from rl_yardstick.pipeline.environments import check_env_id, map_name
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
 from rl_yardstick.pipeline.files import LONGEST_NAME, plain, portable_name

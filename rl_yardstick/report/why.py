@@ -14,7 +14,7 @@ from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
-    from rl_yardstick.diagnosis.explanation import Explanation, Parting, StateLoss
+    from rl_yardstick.diagnosis.explanation import Explanation, StateLoss
     from rl_yardstick.experiments.plan import PlannedRun
     from rl_yardstick.experiments.results import Tried
 
@@ -99,20 +99,6 @@ def _state(state: StateLoss, gap: float) -> str:
             told = [f"{one}, {n:,} updates" for one, n in zip(told, state.updates, strict=True)]
         text += f" ({state.action}: {told[0]}; {state.best}: {told[1]})"
     return text
-
-
-def parting_lines(parting: Parting) -> list[str]:
-    """Where two agents first act differently and what that costs, the largest loss first."""
-    better, worse = parting.names
-    difference = f"{better} returns {parting.difference:.4g} more than {worse}"
-    if not parting.places:
-        return [f"{difference}: their policies are the same in every state that they visit"]
-    told = [f"{difference}; they part in {parting.met:.1%} of the episodes, first at"]
-    return told + [
-        f"  {place.name}: in {place.met:.1%} of the episodes, worth {place.gain:.4g}; "
-        f"{better} does {place.actions[0]}, {worse} {place.actions[1]}"
-        for place in parting.places[:MOST_STATES]
-    ]
 
 
 def course_lines(course: Mapping[int, Explanation]) -> list[str]:

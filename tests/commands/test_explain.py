@@ -53,17 +53,12 @@ def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, r
     assert "16 runs, 16 of them there already" in type_command("explain", run, *words)[1]
 
 
-def test_checkpoints_show_the_course_and_two_agents_where_they_part(type_command, run, tmp_path):
-    last = f"{run}/rl_model_1000_steps.zip"
-    words = ("--course", "--against", last, "--map", "costs.png", "--json", "why.json")
-    code, out, _ = type_command("explain", run, *words)
+def test_checkpoints_show_the_course(type_command, run, tmp_path):
+    words = ("--course", "--map", "costs.png", "--json", "why.json")
+    code = type_command("explain", run, *words)[0]
     data = json.loads(Path("why.json").read_text())
     assert code == 0
     assert [row["timesteps"] for row in data["course"]] == [1000, 2000, 3000]
-    assert sum(place["gain"] for place in data["against"]["places"]) == pytest.approx(
-        data["against"]["difference"]
-    )
-    assert "they part in" in out
     assert (tmp_path / "costs.png").read_bytes().startswith(b"\x89PNG")
 
 

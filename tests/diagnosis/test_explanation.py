@@ -5,12 +5,12 @@ import re
 import pytest
 import torch as th
 
-from rl_yardstick.diagnosis.explanation import explanation, parting
+from rl_yardstick.diagnosis.explanation import explanation
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.mdp import policy_iteration
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.training import make_agent
-from rl_yardstick.report.why import parting_lines, why_lines
+from rl_yardstick.report.why import why_lines
 from tests.pipeline.short_runs import spec_of
 
 LAKE = {"env_kwargs": {"is_slippery": False, "max_episode_steps": 30}}
@@ -159,17 +159,3 @@ def test_the_random_agent_and_planners_have_no_parts_but_states():
     assert random.parts == ()
     assert random.losses.sum() == pytest.approx(random.gap, rel=1e-9)
     assert explained("optimal", "FrozenLake-v1", steps=1).is_optimal
-
-
-def test_two_agents_part_where_one_of_them_goes_wrong():
-    sides = []
-    for wrong in ({}, {(14, 3): 1.01}):
-        spec, agent = run_of("qlearning", "FrozenLake-v1", LAKE)
-        with_values(0.95, wrong)(agent)
-        sides.append((spec, agent, exact_evaluator(spec)))
-    found = parting(*reversed(sides))
-    assert (found.difference, found.met) == (pytest.approx(1), pytest.approx(1))
-    assert [place.name for place in found.places] == ["row 4, column 3"]
-    assert found.names == ("qlearning 2", "qlearning 1")
-    assert parting_lines(found)[1].endswith("qlearning 2 does right, qlearning 1 up")
-    assert parting(sides[0], sides[0]).places == ()
