@@ -117,7 +117,9 @@ class StateCallback(BlockCallback):
         super().__init__()
         self.run, self.resumes, self.others, self.clock = run, resumes, others, clock
         self.process = {"run": run, "exact": judge.exact, "eval_env": judge.env}
-        self.evaluator = {} if judge.exact is not None else {"evaluator": judge.evaluator}
+        self.evaluator: dict[str, Any] = (
+            {} if judge.exact is not None else {"evaluator": judge.evaluator}
+        )
         self.is_possible = True
         self.due_at = time.monotonic() + self.shortest_pause
 

@@ -176,7 +176,8 @@ def _spec_of(path: Path, data: Mapping[str, Any], wanted: Wanted) -> TrainSpec:
     places = [folder / path.stem, folder, *(p.parent for p in folder.glob("*/config.yml"))]
     files = [(place / "args.yml", place / "config.yml") for place in places]  # of rl_zoo3
     present = next((both for both in files if any(file.is_file() for file in both)), ())
-    args, config = [read_saved(file) if file.is_file() else {} for file in present] or ({}, None)
+    saved = [read_saved(file) if file.is_file() else {} for file in present]
+    args, config = saved if saved else (dict[str, Any](), None)
     end = f":{data.get('algorithm')}"  # the class of a hand-written agent
     own = [name for name, one in ALGORITHMS.items() if one.entry_point.endswith(end)]
     algo = wanted.algo or next(iter(own), args.get("algo"))

@@ -59,7 +59,8 @@ def _layers(env: Any) -> Iterator[Any]:
 
 def save_state(path: Path, roots: dict[str, Any], process: tuple[str, ...]) -> None:
     """Write the attributes of all roots and the global generators, signed."""
-    attributes, positions = {}, {}
+    attributes: dict[str, Any] = {}
+    positions: dict[str, int] = {}
     for name, root in roots.items():
         if name not in process:
             left_out = _left_out(type(root))

@@ -161,7 +161,7 @@ class Training:
             "with_replay_buffer": spec.save_replay_buffer,
         }
         given, typed = spec.callback, spec.gym_packages
-        possible = [
+        possible: list[BaseCallback | None] = [
             *(build(one, BaseCallback, "callback", typed, folder) for one in given),
             Checkpoint(every, **checkpoint) if every > 0 else None,
             Checkpoint(None, every_n_episodes, **checkpoint) if every_n_episodes > 0 else None,
