@@ -43,9 +43,8 @@ from rl_yardstick.mdp import (
     policy_return,
     state_values,
 )
-from rl_yardstick.mdp.advantages import expected_next
 from rl_yardstick.mdp.evaluation import canonical_policy, policy_matrix
-from rl_yardstick.mdp.gaps import GapByState, gap_by_state, greedy_repairs
+from rl_yardstick.mdp.gaps import GapByState, expected_next, gap_by_state, greedy_repairs
 from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.environments import make_single_env

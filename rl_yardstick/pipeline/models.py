@@ -180,8 +180,8 @@ def _spec_of(path: Path, data: Mapping[str, Any], wanted: Wanted) -> TrainSpec:
     args, config = saved if saved else (dict[str, Any](), None)
     end = f":{data.get('algorithm')}"  # the class of a hand-written agent
     own = [name for name, one in ALGORITHMS.items() if one.entry_point.endswith(end)]
-    algo = wanted.algo or next(iter(own), args.get("algo"))
-    env_id = wanted.env_id or args.get("env")
+    algo: Any = wanted.algo or next(iter(own), args.get("algo"))
+    env_id: Any = wanted.env_id or args.get("env")
     if not (algo and env_id):
         missing = "--env" if algo else "--algo"
         raise UserError(f"{path} is in no run folder: say what it is with {missing}")
@@ -357,7 +357,8 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
     buffer = replay_buffer_of(path)
     if buffer is None or not isinstance(agent, OffPolicyAlgorithm):
         return agent
-    content, wanted = io.BytesIO(read_bytes(buffer, MAX_MODEL)), agent.replay_buffer
+    content = io.BytesIO(read_bytes(buffer, MAX_MODEL))
+    wanted: Any = agent.replay_buffer
     try:
         load_replay_buffer(agent, content, classes={MaskedReplayBuffer, type(wanted)})
     except (ValueError, AssertionError) as error:

@@ -311,7 +311,7 @@ class Runs:
         self.rewards = np.empty(shape, np.float32)
         self.regrets = np.empty(shape)
         self.contexts = np.empty(shape, np.int32)
-        self.known = {
+        self.known: dict[str, Any] = {
             name: np.repeat(value.numpy()[None], len(seeds), axis=0)
             for name, value in agent.policy.state_dict().items()
         }
@@ -353,7 +353,7 @@ class Runs:
                     kept[index, moment] = self.known[name][index]
 
     def _compiled_agent(self, index: int, model: BanditModel) -> Any:
-        known = {name: each[index] for name, each in self.known.items()}
+        known: dict[str, Any] = {name: each[index] for name, each in self.known.items()}
         rng = self.agent.rng
         if isinstance(self.agent, LinearBanditAgent):
             models = Regressions(**known)
