@@ -41,7 +41,7 @@ def main() -> NoReturn:
     """``yardstick COMMAND`` and ``python -m rl_yardstick COMMAND``."""
     command = sys.argv[1] if len(sys.argv) > 1 else ""
     if command not in COMMANDS:
-        run_command("help")
+        run_command("cli")
     sys.argv = [f"{NAME} {command}", *sys.argv[2:]]
     run_command(command)
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rl_yardstick.commands.cli import OneLineParser, add_shared, command_line, filled
-from rl_yardstick.commands.enjoy import add_model_flags, found_model, wanted_model
+from rl_yardstick.commands import cli
+from rl_yardstick.commands.cli import OneLineParser, flag, shared, switch
+from rl_yardstick.commands.enjoy import MODEL_FLAGS, found_model, wanted_model
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -30,23 +31,19 @@ examples:
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> OneLineParser:
     """The flags: those of enjoy.py that select an agent, and those of the explanation."""
-    parser = OneLineParser(
-        description="Show where an agent loses return against the optimum, exactly.", epilog=EPILOG
+    tested = "train four seeds with this change, as shipped and as it is; without a change: with "
+    tested += "each of the proposed changes"
+    own = (
+        flag("--test", tested, nargs="*", action="append", metavar="KEY:VALUE"),
+        flag("--against", "another agent: where the two part", Path, metavar="MODEL"),
+        flag("--map", "draw the cost of each cell, as .png", Path, metavar="FILE"),
+        switch("--course", "also split the gap of each checkpoint of the run"),
+        *shared("--jobs", "--json"),
     )
-    add_model_flags(parser)
-    group = parser.add_argument_group("explaining")
-    add = group.add_argument
-    test = "train four seeds with this change (KEY:VALUE ...), with the shipped settings and as it "
-    test += "is; repeat the flag to try several changes; without a change, try the proposed ones"
-    add("--test", nargs="*", action="append", metavar="KEY:VALUE", help=test)
-    other = "another agent on the same environment: where the two first differ, and what it costs"
-    add("--against", type=Path, metavar="MODEL", help=other)
-    add("--map", type=Path, metavar="FILE", help="draw the cost of each cell, as .png")
-    add("--course", action="store_true", help="also split the gap of each checkpoint of the run")
-    add("--json", type=filled, metavar="FILE", help="also write the explanation to this file")
-    add_shared(group, "--env-kwargs", "--gym-packages", "--jobs")
+    words = "Show where an agent loses return against the optimum, exactly."
+    parser = OneLineParser(words, EPILOG, {"": MODEL_FLAGS, "explaining": own})
     parser.set_defaults(seed=0)
     return parser
 
@@ -90,7 +87,7 @@ def main() -> int:
     if args.json is not None:
         from rl_yardstick.pipeline.files import write_json
 
-        write_json(Path(args.json), data)
+        write_json(args.json, data)
     return 0
 
 
@@ -145,11 +142,11 @@ def median_run(wanted: Wanted) -> Wanted:
 
     rows = pd.read_csv(table, dtype={"agent": str, "environment": str})
     flags = {"agent": ("--algo", wanted.algo), "environment": ("--env", wanted.env_id)}
-    for column, (flag, name) in flags.items():
+    for column, (typed, name) in flags.items():
         names = [str(each) for each in rows[column].unique()]
         chosen = names[0] if name is None and len(names) == 1 else name
         if chosen not in names:
-            raise UserError(f"{wanted.path} is a study: choose one by {flag}: {', '.join(names)}")
+            raise UserError(f"{wanted.path} is a study: choose one by {typed}: {', '.join(names)}")
         rows = rows[rows[column] == chosen]
     rows = rows.sort_values("final", kind="stable")
     place = Path(str(rows["path"].iloc[(len(rows) - 1) // 2]))  # the study may have been moved
@@ -192,12 +189,11 @@ def tried_changes(
 ) -> list[Any]:
     """Train four seeds as shipped, as it is and with each change; return the returns as JSON."""
     from rl_yardstick.commands.compare import Job, do_study, held
-    from rl_yardstick.commands.engines import about
     from rl_yardstick.commands.terminal import say
-    from rl_yardstick.experiments.interventions import intervention_study, relative_length, tried
+    from rl_yardstick.experiments.interventions import intervention_study, tried
     from rl_yardstick.experiments.plan import StudyRecord, plan, specs_of
     from rl_yardstick.experiments.pool import Workers, available_cores
-    from rl_yardstick.pipeline.run import Run, Stop
+    from rl_yardstick.pipeline.run import Stop
     from rl_yardstick.report.why import tried_lines
 
     spec, run = one.found.spec, one.found.run
@@ -206,16 +202,10 @@ def tried_changes(
     study = intervention_study(spec, changes, name)
     root, specs = Path(args.folder) / "explain" / study.name, specs_of(study)
     planned = plan(study, root, specs=specs)
-    n_workers = max(args.jobs, 0) or available_cores()
-    to_do = [one for one in planned if not one.is_finished]
-    seconds = None if run is None else Run(run).recorded().get("cpu_seconds")
-    if to_do and seconds is not None:
-        length = relative_length(to_do, spec, one.agent.num_timesteps)
-        time = about(seconds * length / min(n_workers, len(to_do)))
-        say(console, f"{len(to_do)} runs, {time} at the pace of this run")
-    with held(root), Workers(n_workers, None) as workers:
+    workers = Workers(max(args.jobs, 0) or available_cores())
+    with held(root), workers:
         StudyRecord(study, specs).write(root)
-        job = Job(root, command_line(), console, Stop().listen(), workers)
+        job = Job(root, cli.command_line(), console, Stop().listen(), workers)
         found = tried(do_study(job, study, planned))
     for line in tried_lines(found, explained.optimum):
         say(console, line)

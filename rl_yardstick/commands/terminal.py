@@ -15,12 +15,9 @@ from rl_yardstick.pipeline.errors import visible
 from rl_yardstick.pipeline.evaluation.yardstick import ROUNDING, rounding
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
     from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 
-UNBOUNDED = 10_000  # columns
 APART = "   "  # between the figures of a result
 
 
@@ -62,18 +59,6 @@ def table_console() -> Console:
     """A console as wide as the terminal; in a file or a pipe, of `COLUMNS` or 80 columns."""
     console = TextConsole()
     return console if console.is_terminal else TextConsole(width=get_terminal_size().columns)
-
-
-def print_rows(console: Console, table: Table) -> None:
-    """Print a table without borders; in a file or a pipe each row is one line, however long."""
-    if console.is_terminal:
-        console.print(table)
-        return
-    wide = TextConsole(width=UNBOUNDED)
-    with wide.capture() as captured:
-        wide.print(table)
-    for line in captured.get().splitlines():
-        console.print(line.rstrip())
 
 
 def say(console: Console, line: str, style: str | None = None) -> None:

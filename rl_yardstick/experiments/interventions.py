@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.results import StudyResults
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from rl_yardstick.mdp.transition_model import Floats
@@ -85,13 +84,6 @@ def _fast(algo: str, settings: dict[str, Any]) -> dict[str, Any]:
     """The settings with compiled code if possible, unless they name an engine."""
     has_auto = "=auto" in arguments_of(algo).get("engine", ())
     return {"engine": "auto", **settings} if has_auto else settings
-
-
-def relative_length(runs: Sequence[PlannedRun], spec: TrainSpec, steps: int) -> float:
-    """The length of all runs, in runs of ``spec``, which took so many steps."""
-    episode = steps / (spec.n_episodes or steps)  # 1 where the length is unknown
-    budgets = [run.spec.n_timesteps or (run.spec.n_episodes or 0) * episode for run in runs]
-    return sum(budgets) / steps
 
 
 def tried(results: StudyResults) -> list[Tried]:

@@ -122,7 +122,7 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(type_command,
     columns = ["agent", "seed", "final", "training", "n_timesteps"]
     assert rows(folder / "copy")[columns].equals(rows(study)[columns])
     code, _, err = type_command("--resume", "copy", "--seeds", 3)
-    assert (code, "leave out seeds" in err) == (2, True)
+    assert (code, "--seeds cannot be given with --resume" in err) == (2, True)
 
 
 def test_films_and_pages_of_training(type_command, folder, monkeypatch):

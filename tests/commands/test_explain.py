@@ -48,7 +48,7 @@ def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, r
     assert code == 0
     assert [*tried] == ["as shipped", "as it is", "n_timesteps:60000", "gamma:0.5"]
     assert {len(returns) for returns in tried.values()} == {4}
-    assert "16 runs, about" in out
+    assert "16 runs, 0 of them there already" in out
     assert "n_timesteps:60000 helps most" in out
     assert "16 runs, 16 of them there already" in type_command("explain", run, *words)[1]
 

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from rl_yardstick.commands.terminal import result_lines
-from rl_yardstick.commands.train import describe_pulls, next_commands, other_agent, rows_of
+from rl_yardstick.commands.train import describe_pulls, next_commands, rows_of
 from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.pipeline.callbacks import PullSummary
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
@@ -155,7 +155,7 @@ def test_what_to_type_next(monkeypatch, tmp_path):
     spec = spec_of("qlearning", "FrozenLake-v1", entry)
     run = Run.claim(Path("else where"), spec)
     chosen = "--algo qlearning --env FrozenLake-v1 -f 'else where'"
-    compared = "python compare.py --env FrozenLake-v1 --algos qlearning sarsa"
+    compared = "python compare.py --env FrozenLake-v1 --algos qlearning"
     explained, plain = (SimpleNamespace(can_be_explained=one) for one in (True, False))
     assert next_commands(spec, run, explained) == [
         ("watch", f"python enjoy.py {chosen}"),
@@ -165,18 +165,6 @@ def test_what_to_type_next(monkeypatch, tmp_path):
     older = run
     Run.claim(Path("else where"), spec)
     assert next_commands(spec, older, plain)[0] == ("watch", f"python enjoy.py '{run.path}'")
-
-
-@pytest.mark.parametrize(
-    ("algo", "env_id", "other"),
-    [
-        ("qlearning", "FrozenLake-v1", "sarsa"),
-        ("ppo", "Pendulum-v1", "sac"),
-        ("thompson", "BernoulliBandit-v0", "epsilon_greedy"),
-    ],
-)
-def test_the_other_agent_fits(algo, env_id, other):
-    assert other_agent(spec_of(algo, env_id)) == other
 
 
 # --- whole commands -------------------------------------------------------------------------------
