@@ -11,6 +11,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, NoReturn
@@ -90,11 +91,7 @@ class OneLineParser(argparse.ArgumentParser):
     """A parser of groups of flags, by their titles, whose errors are one line."""
 
     def __init__(
-        self,
-        description: str,
-        epilog: str,
-        flags: Flags | None = None,
-        **kwargs: Any,
+        self, description: str, epilog: str, flags: Flags | None = None, **kwargs: Any
     ) -> None:
         kwargs.setdefault("prog", os.path.basename(sys.argv[0]))  # noqa: PTH119  # a name
         for command in COMMANDS:
@@ -172,18 +169,15 @@ def whole_number(
     meanings = besides or {}
 
     def read(text: str) -> int:
-        try:
+        with suppress(InvalidOperation):
             number = Decimal(text)
             if number == number.to_integral_value() and abs(number) <= LARGEST:
                 found = int(number)
                 if least <= found <= most or found in meanings:
                     return found
-        except InvalidOperation:
-            pass
-        bounds = f" of at least {least:,}" if least > -LARGEST else ""
-        bounds += f" and at most {most:,}" if most < LARGEST else ""
         others = "".join(f", or {key} ({meaning})" for key, meaning in meanings.items())
-        raise argparse.ArgumentTypeError(f"must be a whole number{bounds}{others}, not {text!r}")
+        bounds = f"from {least:,} to {most:,}{others}"
+        raise argparse.ArgumentTypeError(f"must be a whole number {bounds}, not {text!r}")
 
     return read
 
@@ -302,10 +296,8 @@ def check_device(device: str) -> None:
     try:
         th.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:
-        raise UserError(
-            f"--device: PyTorch has no {device!r} here: 'auto' takes the best one, 'cpu' is "
-            "always there"
-        ) from error
+        text = f"--device: PyTorch has no {device!r} here: take 'auto' or 'cpu'"
+        raise UserError(text) from error
 
 
 def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dict[str, Any]:

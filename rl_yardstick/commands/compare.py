@@ -38,9 +38,7 @@ if TYPE_CHECKING:
 EPILOG = """\
 examples:
   python compare.py --env FrozenLake-v1 --algos qlearning sarsa dqn ppo --seeds 10
-  python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --engine auto
   python compare.py studies/warehouse-learning-rate.yml
-  python compare.py studies/warehouse-learning-rate.yml --quick
   python compare.py studies/warehouse-learning-rate.yml --until-decided
   python compare.py --resume logs/studies/warehouse-learning-rate
   python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
@@ -81,7 +79,6 @@ FLAGS: Flags = {
     ),
     "runs": (
         *shared("--jobs", "--cluster", "--run-timeout"),
-        switch("--replace", "do finished runs with other settings again; old folders are kept"),
         flag("--resume", "do what is left of the study in this folder", Path, metavar="STUDY"),
     ),
     "judgement and output": (
@@ -143,7 +140,7 @@ def main() -> int:
 
             looks = plan_of_looks(record.study, root, args.max_seeds)
             record = replace(record, looks=looks)
-        return carry_out(job, record, args.replace)
+        return carry_out(job, record)
 
 
 @dataclass(frozen=True)
@@ -160,37 +157,34 @@ class Job:
 
 @contextmanager
 def held(root: Path) -> Iterator[None]:
-    """Hold a study's folder; it is removed again if nothing comes of it."""
-    from rl_yardstick.pipeline.run import LOCK, Run
+    """Hold a study's folder; a new one is removed again if an error leaves nothing in it."""
+    from rl_yardstick.pipeline.run import Run
 
+    run = Run(root)  # with the lock of a run's folder
+    run.is_new = not root.exists()
     root.mkdir(parents=True, exist_ok=True)
-    with Run(root):  # with the lock of a run's folder
+    with run:
         try:
             yield
         finally:
-            if [path.name for path in root.iterdir()] == [LOCK]:
-                (root / LOCK).unlink()
-                with suppress(OSError):  # of folders above that are not empty
-                    for folder in (root, *list(root.parents)[:2]):
-                        folder.rmdir()
+            run.has_begun = len([*root.iterdir()]) > 1  # more than the lock
 
 
 def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> Workers:
     """The workers that the flags ask for."""
     from rl_yardstick.experiments.pool import Workers, available_cores
 
-    jobs = max(args.jobs, 0)
     if args.cluster is None:
-        return Workers(jobs or available_cores(), timeout)
+        return Workers(max(args.jobs, 0) or available_cores(), timeout)
     try:
         from rl_yardstick.experiments.cluster import ClusterWorkers
 
-        return ClusterWorkers(args.cluster, jobs, root, timeout)
+        return ClusterWorkers(args.cluster, max(args.jobs, 0), root, timeout)
     except ImportError:
         raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'") from None
 
 
-def carry_out(job: Job, record: StudyRecord, replaces: bool = False) -> int:
+def carry_out(job: Job, record: StudyRecord) -> int:
     """Do a study, and judge it; return 0 if all runs are finished, else 1."""
     from rl_yardstick.experiments.growing import first_counts
     from rl_yardstick.experiments.plan import plan
@@ -198,44 +192,33 @@ def carry_out(job: Job, record: StudyRecord, replaces: bool = False) -> int:
     study, looks = record.study, record.looks
     counts = first_counts(study) if looks else None
     planned = plan(study, job.root, counts, record.specs)
-    check_settings_kept(job, planned, replaces)
+    check_settings_kept(job.root, planned)
     record.write(job.root)
     if not looks:
         return conclude(job, do_study(job, study, planned), ())
     results, said = look_by_look(job, record)
     code = conclude(job, results, looks)
-    # The number of runs, compared with a design that gives every agent all seeds.
-    open_ = [p for p in said.pairs if p.word == "undecided"]
-    undecided = "; ".join(f"{p.first} and {p.second} on {p.environment}" for p in open_)
-    left = f"undecided: {undecided}" if undecided else "all is decided"
+    n_undecided = sum(pair.word == "undecided" for pair in said.pairs)
+    left = f"{n_undecided} pairs are undecided" if n_undecided else "all is decided"
     n_runs = sum(sum(by.values()) for by in said.seeds.values())
     design = f"{looks[-1]:,} seeds of each agent would be {looks[-1] * len(record.specs):,}"
     job.console.print(f"{n_runs:,} runs, where {design}; {left}")
     return code
 
 
-def check_settings_kept(job: Job, planned: Sequence[PlannedRun], replaces: bool) -> None:
-    """Refuse to do runs again that finished with other settings, or move them aside."""
+def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
+    """Refuse a study in whose folder runs have finished with other settings."""
     from rl_yardstick.experiments.plan import other_settings
 
     others = other_settings(planned)
-    if not others:
-        return
-    if not replaces:
+    if others:
         pairs = {key: pair for _, settings in others for key, pair in settings.items()}
         named = [f"{key}: {shown(a)} there, {shown(b)} now" for key, (a, b) in pairs.items()]
         words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
         runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
         raise UserError(
-            f"{job.root}: {runs} other settings ({words}): --name NAME makes another study of it, "
-            "--replace does them again and moves the old ones to replaced/"
+            f"{root}: {runs} other settings ({words}): give the study another folder by --name NAME"
         )
-    place = job.root / "replaced" / str(len([*job.root.glob("replaced/*")]) + 1)
-    for run, _ in others:
-        target = place / run.path.relative_to(job.root / "runs")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        run.path.rename(target)
-    job.console.print(f"{len(others)} runs are done again: the old folders are in {place} now")
 
 
 def do_study(
@@ -386,8 +369,8 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
 
     if args.max_seeds is not None and not args.until_decided:
         raise UserError("--max-seeds belongs to --until-decided: give both, or --seeds")
-    if args.until_decided and (args.is_quick or args.replace):
-        raise UserError("--until-decided goes neither with --quick nor with --replace")
+    if args.until_decided and args.is_quick:
+        raise UserError("--until-decided and --quick do not go together: give one of them")
     if args.learning_pages and args.no_report:
         raise UserError("--watch-learning is a section of the page: leave out --no-report")
     if args.metric is not None and args.metric not in METRICS:
@@ -496,9 +479,8 @@ def compare_on_log(args: argparse.Namespace) -> int:
     if args.study or args.env or args.algos:
         raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
     columns = dict(word.partition("=")[::2] for word in args.columns)
-    known = ("arm", "reward", "propensity")
-    if wrong := next((name for name in columns if name not in known or not columns[name]), None):
-        raise UserError(f"--columns {wrong}: give names such as arm=item_id, of {known}")
+    if wrong := columns.keys() - {"arm", "reward", "propensity"}:
+        raise UserError(f"--columns {wrong.pop()}: name arm, reward or propensity, as arm=item_id")
     console = table_console()
     from rl_yardstick.experiments.off_policy import compare_policies, load_policy, read_logged
     from rl_yardstick.report.terminal import print_comparison

@@ -18,7 +18,6 @@ from rl_yardstick.pipeline.errors import UserError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from rl_yardstick.pipeline.evaluation.sampled import Evaluation
     from rl_yardstick.pipeline.models import Model, Wanted
     from rl_yardstick.pipeline.playing import RenderMode
     from rl_yardstick.pipeline.spec import TrainSpec
@@ -28,7 +27,6 @@ FRAMES_PER_SECOND = 4  # of --render ansi on a terminal
 EPILOG = """\
 examples:
   python enjoy.py --env Warehouse-v0 --algo ppo
-  python enjoy.py --env FrozenLake-v1 --algo qlearning --load-best --n-episodes 1000 --render none
   python enjoy.py --env Warehouse-v0 --algo sarsa --record route.gif --n-episodes 1
   python enjoy.py logs/dqn/CartPole-v1_3/rl_model_20000_steps.zip
   python enjoy.py --algo ppo --env MountainCar-v0 -f rl-trained-agents
@@ -146,9 +144,8 @@ def play(console: Console, found: Model, args: argparse.Namespace) -> None:
     """Play episodes, show or film them, and print their returns and the policy's exact return."""
     with console.status("loading the agent"):
         import torch as th
-        from gymnasium.error import DependencyNotInstalled
 
-        from rl_yardstick.commands.terminal import result_lines, say
+        from rl_yardstick.commands.terminal import say
         from rl_yardstick.pipeline.models import load_agent
         from rl_yardstick.pipeline.playing import play_episodes, playing_env, write_film
 
@@ -159,29 +156,23 @@ def play(console: Console, found: Model, args: argparse.Namespace) -> None:
         env: Any = playing_env(found, mode, args.n_envs, returns, args.norm_reward)
         agent = load_agent(found, env)
         env.seed(spec.seed)
-    is_live = mode == "ansi" and console.is_terminal and not console.quiet
-    show = LiveShow(console, env, mode, agent) if is_live else Show(console, env, mode, agent)
+    show = Show(console, env, agent, mode)
     n_steps = args.n_timesteps if args.n_timesteps > 0 else None
     n_episodes = 10 if args.n_episodes is None and n_steps is None else args.n_episodes
     given: Any = {"before_step": show.before_step, "after_step": show.after_step}
     given |= {"deterministic": not args.stochastic}
-    try:
-        with console.status("playing") if mode != "ansi" else show.live:
-            for episode in play_episodes(agent, env, n_episodes, n_steps, **given):
-                show.after_episode(*episode)
-    except DependencyNotInstalled as error:  # noticed at the first picture
-        raise UserError(f"{spec.env_id}: {error}") from error
+    with show.live if mode == "ansi" else console.status("playing"):
+        for episode in play_episodes(agent, env, n_episodes, n_steps, **given):
+            show.after_episode(*episode)
     env.close()
     if args.record is not None:
         with console.status("writing the film"):
             write_film(Path(args.record), show.frames)
         say(console, f"film: {args.record}")
-    for line in played_lines(spec, show, args.norm_reward):
-        say(console, line)
     with console.status("computing the policy's expected return"):
-        exact = expected_return(spec, agent, not args.stochastic)
-    for line in [exact] if isinstance(exact, str) else result_lines(exact) if exact else []:
-        say(console, line)
+        lines = played_lines(spec, show, args.norm_reward)
+        lines += expected_lines(spec, agent, not args.stochastic)
+    say(console, "\n".join(lines))
 
 
 def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
@@ -200,73 +191,51 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
     return result_lines(played, f"length {figures(played.mean_length)[0]}")
 
 
-def expected_return(spec: TrainSpec, agent: Any, deterministic: bool) -> Evaluation | str | None:
-    """The policy's exact evaluation; or a line on why figures are sampled; None if unknown."""
+def expected_lines(spec: TrainSpec, agent: Any, deterministic: bool) -> list[str]:
+    """The policy's exact evaluation, or why figures are sampled; empty if the model is unknown."""
+    from rl_yardstick.commands.terminal import result_lines
     from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
     from rl_yardstick.pipeline.evaluation.histories import by_histories, world_of_memory
     from rl_yardstick.pipeline.evaluation.policies import why_not_exact
 
     world = world_of_memory(spec, agent) if deterministic else None
     if world is not None and (found := by_histories(spec, agent, world)) is not None:
-        return found
+        return result_lines(found)
     evaluator = exact_evaluator(spec)
     if evaluator is None:
         refusal = model_refusal(spec)
-        return None if refusal is None else f"{refusal}; figures are sampled"
+        return [f"{refusal}; figures are sampled"] if refusal else []
     if reason := evaluator.obstacle(agent, deterministic):
-        return f"sampled, not exact: {spec.algo}: {reason}"
+        return [f"sampled, not exact: {spec.algo}: {reason}"]
     if not why_not_exact(agent, evaluator.observations):
         with suppress(TypeError, ValueError):  # its action probabilities may not be known
-            return evaluator(agent, deterministic)
-    return None
+            return result_lines(evaluator(agent, deterministic))
+    return []
 
 
 # --- what is shown --------------------------------------------------------------------------------
 
 
 class Show:
-    """Prints episodes as they end, prints frames of text, and keeps those of films."""
+    """Prints episodes as they end, shows frames of text, and keeps those of films.
 
-    live: Any = nullcontext()
+    On a terminal, each frame of text replaces the last, with the agent's figures beside it.
+    """
 
-    def __init__(self, console: Console, env: Any, mode: RenderMode | None, agent: Any) -> None:
-        from rl_yardstick.pipeline.playing import FrameTaker
-
-        self.console, self.mode, self.agent = console, mode, agent
-        self.taker = FrameTaker(env)
-        self.frames: list[Any] = []
-        self.played: list[tuple[float, int]] = []  # returns and lengths of episodes
-
-    def before_step(self, obs: Any, actions: Any) -> None:
-        """Frames are shown after the step."""
-
-    def after_step(self, done: bool) -> None:
-        """Show or keep the frames."""
-        if self.mode == "rgb_array":
-            self.frames += self.taker.take(done)
-        elif self.mode == "ansi":
-            for text in self.taker.take(done):
-                self.console.file.write(f"{text}\n")  # with its colours
-
-    def after_episode(self, total_return: float, length: int) -> None:
-        """Print an episode's return and length."""
-        self.played.append((total_return, length))
-        told = f"episode {len(self.played)}: return {total_return:.2f}, {length} steps"
-        self.console.print(told, soft_wrap=True)
-
-
-class LiveShow(Show):
-    """Draws the environment as text on a terminal, beside the agent's figures of its actions."""
-
-    def __init__(self, console: Console, env: Any, mode: RenderMode | None, agent: Any) -> None:
+    def __init__(self, console: Console, env: Any, agent: Any, mode: RenderMode | None) -> None:
         from rich.live import Live
 
         from rl_yardstick.envs.layout import action_names
+        from rl_yardstick.pipeline.playing import FrameTaker
 
-        super().__init__(console, env, mode, agent)
-        self.names = action_names(env.unwrapped.envs[0])
-        self.live = Live(console=console, auto_refresh=False, vertical_overflow="crop")
+        self.console, self.agent, self.mode = console, agent, mode
+        self.taker, self.frames = FrameTaker(env), list[Any]()
+        self.played: list[tuple[float, int]] = []  # returns and lengths of episodes
         self.step = 0  # of the episode
+        self.is_live = mode == "ansi" and console.is_terminal and not console.quiet
+        live = Live(console=console, auto_refresh=False, vertical_overflow="crop")
+        self.live: Any = live if self.is_live else nullcontext()
+        self.names = action_names(env.unwrapped.envs[0]) if self.is_live else ()
 
     def before_step(self, obs: Any, actions: Any) -> None:
         """Draw the state with a figure for each action, and mark the chosen one."""
@@ -274,6 +243,8 @@ class LiveShow(Show):
 
         from rl_yardstick.pipeline.evaluation.policies import action_figures
 
+        if not self.is_live:
+            return
         table, figures = Table.grid(padding=(0, 1)), action_figures(self.agent, obs)
         if figures is not None:
             table.add_row("", "action", figures.word, style="dim")
@@ -284,11 +255,22 @@ class LiveShow(Show):
         self.draw(self.taker.take(done=False), table)
 
     def after_step(self, done: bool) -> None:
-        """Draw the last state of an episode."""
+        """Show or keep the frames; of a live picture, the last one of an episode."""
         self.step += 1
-        if done:
-            self.draw(self.taker.take(done=True), "")
-            self.step = 0
+        if self.mode == "rgb_array":
+            self.frames += self.taker.take(done)
+        elif self.is_live and done:
+            self.draw(self.taker.take(done), "")
+        elif self.mode == "ansi" and not self.is_live:
+            for text in self.taker.take(done):
+                self.console.file.write(f"{text}\n")  # with its colours
+        self.step = 0 if done else self.step
+
+    def after_episode(self, total_return: float, length: int) -> None:
+        """Print an episode's return and length."""
+        self.played.append((total_return, length))
+        told = f"episode {len(self.played)}: return {total_return:.2f}, {length} steps"
+        self.console.print(told, soft_wrap=True)
 
     def draw(self, frames: Sequence[str], beside: Any) -> None:
         """Draw the title and the last frame in place of those before."""

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 EPILOG = """\
 examples:
   python -m rl_yardstick explain --env FrozenLake-v1 --algo qlearning
-  python -m rl_yardstick explain logs/dqn/Taxi-v4_1 --json why.json
   python -m rl_yardstick explain logs/my_study --algo dqn --env Taxi-v4     # its median run
   python -m rl_yardstick explain logs/sarsa/CliffWalking-v1_1 \\
     --against logs/qlearning/CliffWalking-v1_1

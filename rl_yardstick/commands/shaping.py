@@ -28,7 +28,7 @@ ROUNDING = 1e-9
 EPILOG = """\
 examples:
   python -m rl_yardstick shaping --env Warehouse-v0 --algo ppo
-  python -m rl_yardstick shaping --env Warehouse-v0 --train-env-kwargs shelf_reward:-1 --gamma 0.99
+  python -m rl_yardstick shaping --env Warehouse-v0 --train-env-kwargs goal_reward:5
   python -m rl_yardstick shaping --env FrozenLake-v1 \\
     --wrapper rl_yardstick.envs.wrappers.TerminationReward reward:-1
 """
@@ -47,7 +47,6 @@ def build_parser() -> OneLineParser:
         *shared("--env-kwargs"),
         several("--train-env-kwargs", "environment arguments in training, not the settings'"),
         several("--wrapper", around, metavar, action="append"),
-        flag("--gamma", "discount (default: the agent's)", float),
         *shared("--hyperparams", "--conf-file", "--gym-packages", "--json"),
     )
     parser = OneLineParser(words, EPILOG, {"": flags})
@@ -64,7 +63,7 @@ def main() -> int:
 
     console = TextConsole()
     spec = _spec(args)
-    discount = _discount(args, spec)
+    discount = _discount(spec)
     changes = ", ".join(training_changes(spec)) or "nothing"
     say(console, f"{spec.env_id}; changed in training: {changes}")
     with closing(make_single_env(spec)) as env:
@@ -102,17 +101,17 @@ def _spec(args: argparse.Namespace) -> TrainSpec:
     return spec
 
 
-def _discount(args: argparse.Namespace, spec: TrainSpec) -> float:
-    """The discount of the flag, else of the settings, else the default of the agent's class."""
+def _discount(spec: TrainSpec) -> float:
+    """The discount of the settings, else the default of the agent's class."""
     from rl_yardstick.agents import load_algorithm
     from rl_yardstick.pipeline.arguments import constructor_parameters
 
-    found = spec.algorithm.get("gamma") if args.gamma is None else args.gamma
+    found = spec.algorithm.get("gamma")
     if found is None:
         parameter = constructor_parameters(load_algorithm(spec.algo)).get("gamma")
         found = None if parameter is None else parameter.default
     if not isinstance(found, int | float) or not 0 <= found <= 1:
-        raise UserError(f"--gamma: a discount from 0 to 1 is needed, not {found}")
+        raise UserError(f"gamma: a discount from 0 to 1 is needed, not {found}")
     return float(found)
 
 

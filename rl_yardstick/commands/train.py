@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rl_yardstick.pipeline.spec import TrainSpec
     from rl_yardstick.pipeline.training import Outcome, Parts
 
+RESUMED = "this run, or the newest unfinished one of --algo and --env"
 WATCHED = whole_number(1, besides={0: "the steps in which its policy improves"})
 # Flags that may stand beside --resume: none of the training itself.
 _BESIDE_RESUME = {"resume", "log_folder", "gym_packages", "verbose", "progress"}
@@ -38,7 +39,6 @@ EPILOG = """\
 examples:
   python train.py --env Warehouse-v0 --algo ppo --engine auto
   python train.py --env FrozenLake-v1 --algo qlearning --n-episodes 5000 --seed 0
-  python train.py --env CartPole-v1 --algo dqn -params learning_rate:lin_0.003 buffer_size:50000
   python train.py --env Warehouse-v0 --algo sarsa --env-kwargs shelf_reward:-1 slip:0.1
   python train.py --resume logs/ppo/Warehouse-v0_3
   python train.py --list
@@ -63,11 +63,7 @@ FLAGS: Flags = {
     ),
     "evaluation and output": (
         flag("--eval-freq", "steps between evaluations; -1 for none", cli.INTERVAL),
-        flag(
-            "--eval-episodes",
-            "episodes of each (adaptive: at most 20, or 100 at the end)",
-            cli.COUNT,
-        ),
+        flag("--eval-episodes", "episodes of each (at most 20, or 100 at the end)", cli.COUNT),
         flag("--n-eval-envs", "environments to evaluate on (10)", cli.COUNT, 10),
         flag("--save-freq", "steps between checkpoints", cli.INTERVAL, -1),
         switch("--save-replay-buffer", "save the replay buffer too"),
@@ -82,18 +78,8 @@ FLAGS: Flags = {
         flag("--watch-episodes", "first episodes of a table to play on it", WATCHED, 0),
     ),
     "resuming": (
-        flag(
-            "--resume",
-            "resume this run, or the newest unfinished one of --algo and --env, to the same bits",
-            nargs="?",
-            const="",
-            metavar="RUN",
-        ),
-        switch(
-            "--resume-or-start",
-            "resume the newest run with these settings; start one if there is none, and do "
-            "nothing if it is finished: for scripts that a queue starts again",
-        ),
+        flag("--resume", RESUMED, nargs="?", const="", metavar="RUN"),
+        switch("--resume-or-start", "resume the newest run with these settings, or start one"),
     ),
 }
 
@@ -198,9 +184,8 @@ def entry_from_flags(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
         training_follows,
     )
 
-    changes = cli.with_engine(
-        args.algo, parse_assignments(args.hyperparams, "-params"), args.engine
-    )
+    typed = parse_assignments(args.hyperparams, "-params")
+    changes = cli.with_engine(args.algo, typed, args.engine)
     for key in ("env_kwargs", "eval_env_kwargs"):
         if given := getattr(args, key):
             named = parse_assignments(given, f"--{key.replace('_', '-')}")
@@ -263,12 +248,16 @@ def unfinished_run(args: argparse.Namespace) -> Path:
     """The run of ``--resume``, or the newest unfinished one of ``--algo`` and ``--env``."""
     beside = _BESIDE_RESUME if args.resume else _BESIDE_RESUME | {"algo", "env"}
     cli.check_alone(build_parser(), beside)
-    found = Path(args.resume) if args.resume else newest_run(args, is_unfinished)
-    if found is None:
-        raise UserError(f"{args.log_folder} has no unfinished run of {args.algo} on {args.env}")
-    if not found.is_dir():
-        raise UserError(f"{found}: there is no such run folder")
-    return found
+    if not args.resume:
+        over = (None, "finished")
+        found = newest_run(args, lambda run: run.recorded().get("state") not in over)
+        if found is None:
+            where = f"{args.log_folder} has no unfinished run"
+            raise UserError(f"{where} of {args.algo} on {args.env}")
+        return found
+    if not Path(args.resume).is_dir():
+        raise UserError(f"{args.resume}: there is no such run folder")
+    return Path(args.resume)
 
 
 def newest_run(args: argparse.Namespace, fits: Callable[[Run], bool]) -> Path | None:
@@ -277,11 +266,6 @@ def newest_run(args: argparse.Namespace, fits: Callable[[Run], bool]) -> Path | 
 
     runs = numbered_runs(Path(args.log_folder) / args.algo, args.env.replace("/", "-"))
     return next((path for _, path in reversed(runs) if fits(Run(path))), None)
-
-
-def is_unfinished(run: Run) -> bool:
-    """Whether a run has begun and not finished."""
-    return run.recorded().get("state") not in (None, "finished")
 
 
 def has_spec(spec: TrainSpec, any_seed: bool, run: Run) -> bool:
@@ -306,12 +290,9 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     for key, value in spec.hyperparams.items():
         if key == "policy" and not str(value).startswith(("Mlp", "Cnn", "MultiInput")):
             continue  # our tables and bandits have one each
-        text = str(value)  # a whole map would fill the screen
-        text = f"{key}={text if len(text) <= 200 else f'{text[:200]}...'}"
-        if note := spec.origins.get(key):
-            explained.append(f"{text} ({note})")
-        else:
-            plain.append(text)
+        note = spec.origins.get(key)
+        text = f"{key}={str(value)[:200]}"  # a whole map would fill the screen
+        (explained if note else plain).append(f"{text} ({note})" if note else text)
     for line in ["  ".join(plain), *explained] if plain else explained:
         console.print(line, style="dim")
 
@@ -341,8 +322,8 @@ def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Outcome)
             console.print(f"try      {outcome.advice.try_first}")
         say(console, "more     docs/not-learning.md")
     say(console, "")
-    for label, command in next_commands(spec, run, outcome):
-        say(console, f"{label:<9}{command}")  # however long, so that it can be copied
+    for line in next_commands(run, spec.gym_packages, outcome):
+        say(console, line)
     if outcome.watch is not None and spec.watch_learning is not None and outcome.watch.has_begun:
         from rl_yardstick.report.page.learning import write_learning_page
 
@@ -390,28 +371,14 @@ def describe_pulls(pulls: PullSummary) -> str:
     return f"regret not known{APART}reward {pulls.reward:.4f} a pull over the {known}"
 
 
-def next_commands(spec: TrainSpec, run: Run, outcome: Outcome) -> list[tuple[str, str]]:
-    """Labels and commands, for the working directory of the training."""
-    from rl_yardstick.pipeline.run import numbered_runs
-    from rl_yardstick.pipeline.settings import entry_names
-
-    log_folder = run.path.parents[1]
-    chosen = [str(run.path)]
-    if numbered_runs(run.path.parent, spec.env_name)[-1][1] == run.path:  # the newest
-        chosen = ["--algo", spec.algo, "--env", spec.env_id]
-        chosen += ["-f", str(log_folder)] if str(log_folder) != "logs" else []
-    compared = ["--env", spec.env_id, "--algos", spec.algo]
-    words = [f"{key}:{value}" for key, value in spec.env_kwargs.items()]
-    compared += ["--env-kwargs", *words] if words else []
-    if not entry_names(spec.algo):  # no shipped settings say how long to train
-        budget = ["-n", spec.n_timesteps] if spec.n_timesteps else ["--n-episodes", spec.n_episodes]
-        compared += map(str, budget)
-    compared += ["--seeds", "10"]
-    compared += ["--engine", "auto"] if spec.algorithm.get("engine") == "auto" else []
-    found = [("watch", "enjoy", chosen), ("explain", "explain", chosen)]
-    found = [*found[: 1 + outcome.can_be_explained], ("compare", "compare", compared)]
-    more = ["--gym-packages", *spec.gym_packages] if spec.gym_packages else []
-    return [(label, f"{cli.called_as(name)} {shlex.join([*w, *more])}") for label, name, w in found]
+def next_commands(run: Run, gym_packages: list[str], outcome: Outcome) -> list[str]:
+    """Commands to type next, in the working directory of the training."""
+    more = ["--gym-packages", *gym_packages] if gym_packages else []
+    labels = ("watch    ", "enjoy"), ("explain  ", "explain")
+    return [
+        f"{label}{cli.called_as(command)} {shlex.join([str(run.path), *more])}"
+        for label, command in labels[: 1 + outcome.can_be_explained]
+    ]
 
 
 # --- the lists of agents and environments ---------------------------------------------------------

@@ -50,8 +50,6 @@ EPILOG = """\
 examples:
   python tune.py --env Warehouse-v0 --algo ppo --trials 100
   python tune.py --env FrozenLake8x8-v1 --algo ppo --engine auto -j 4
-  python tune.py --env CartPole-v1 --algo dqn --seeds-per-trial 10 --objective lower
-  python tune.py --env Taxi-v4 --algo qlearning --sampler grid
 
 The same command again continues the search.
 """
@@ -128,11 +126,6 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
         raise UserError("tuning needs: pip install 'rl-yardstick[tune]'")
     check_agent(args.algo)
     check_env_id(args.env)
-    for name, path in (("--conf-file", args.conf_file), ("--search-space", args.search_space)):
-        if path is not None and not path.is_file():
-            raise UserError(f"{name}: there is no file {path}")
-    if args.n_timesteps is not None and args.n_episodes is not None:
-        raise UserError("how long to train? give -n or --n-episodes, not both")
     # The settings that the command line fixes.
     settings = cli.with_engine(args.algo, compare.typed_settings(args), args.engine)
     study = StudySpec(
@@ -229,11 +222,7 @@ def do_retest(job: Job, search: Search) -> int:
             print_winner(job.console, search, outcome.winner.number, path)
         return code
     if search.tuning.retest:
-        which = "no settings but the shipped ones" if ranked else "no settings"
-        why = f"{which} were judged to the end"
-        if any(each.number for each in ranked):
-            why = "the best settings are clearly below the shipped settings in the search"
-        say(job.console, f"{why}: no re-test")
+        say(job.console, "no re-test: no other setting came close to the shipped one")
     write_down(job, search, None)
     return 0 if ranked or not search.is_done else 1
 
@@ -286,46 +275,37 @@ def print_opened(job: Job, search: Search) -> None:
     """Print the number of trials, seeds and free settings."""
     from rl_yardstick.tuning.retesting import unproven_mark
 
-    tuning, suggestions = search.tuning, search.suggestions
+    suggestions = search.suggestions
     n_there = sum(trial.state.is_finished() for trial in search.trials)
-    there = f"{search.n_trials} trials of up to {len(tuning.seeds)} seeds, {n_there} of them there"
-    free = f"{suggestions.n_free} settings to choose; {job.workers.words}, in {job.root}"
-    lines = [f"{there} already; {free}"]
-    if mark := unproven_mark(tuning):
-        lines.append(f"scores are{mark}")
+    words = f"{search.n_trials} trials of up to {len(search.tuning.seeds)} seeds, {n_there} of "
+    words += f"them there already; {suggestions.n_free} settings to choose; {job.workers.words}"
+    say(job.console, f"{words}, in {job.root}")
+    if mark := unproven_mark(search.tuning):
+        say(job.console, f"scores are{mark}")
     if suggestions.fits_batches:
-        lines.append("batch_size: the nearest number that divides n_steps times n_envs is tried")
-    wider = "the search space is widened to hold the shipped value"
-    for line in [*lines, *(f"{name}: {wider}" for name in suggestions.space.widened)]:
-        say(job.console, line)
-
-
-_STATES = {"COMPLETE": "judged to the end", "PRUNED": "ended early", "FAIL": "failed"}
+        text = "batch_size: the nearest number that divides n_steps times n_envs is tried"
+        say(job.console, text)
+    for name in suggestions.space.widened:
+        say(job.console, f"{name}: the search space is widened to hold the shipped value")
 
 
 def print_search(console: Console, search: Search) -> None:
     """Print the cost of the search, and whether several settings reach the optimum."""
     from rl_yardstick.tuning.searching import FAILURE, outcomes_of
 
-    trials, n_seeds = search.trials, len(search.tuning.seeds)
+    trials, n_runs = search.trials, search.n_trials * len(search.tuning.seeds)
     states = Counter(
-        "failed" if FAILURE in trial.user_attrs else _STATES.get(trial.state.name, "to do")
-        for trial in trials
+        "failed" if FAILURE in trial.user_attrs else trial.state.name.lower() for trial in trials
     )
-    states["to do"] += search.n_trials - len(trials)
     runs = [run for trial in trials for run in outcomes_of(trial).values()]
-    counts = ", ".join(f"{count} {state}" for state, count in (+states).items())
-    say(
-        console,
-        f"{search.n_trials} trials: {counts}; {len(runs)} of {search.n_trials * n_seeds} runs, "
-        f"{sum(run.seconds for run in runs):,.0f} s of processor time",
-    )
+    counts = ", ".join(f"{count} {state}" for state, count in states.items())
+    spent = f"{sum(run.seconds for run in runs):,.0f} s of processor time"
+    say(console, f"trials: {counts}; {len(runs)} of {n_runs} runs, {spent}")
     if (n := search.n_at_optimum) > 1:
-        text = f"{n} settings have the optimum on all seeds, so their scores are tied: they are "
-        text += "ranked by steps to the threshold"
+        text = f"{n} settings have the optimum on all seeds: they are ranked by steps to the "
+        text += "threshold"
         if search.is_saturated and not search.is_done:
-            text += "; the search ends here, since more trials cannot score more (--metric steps "
-            text += "searches for the fastest)"
+            text += "; the search ends here (--metric steps searches for the fastest)"
         say(console, text)
 
 

@@ -20,7 +20,6 @@ from rl_yardstick.pipeline.callbacks import PullSummary
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
 from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
 from rl_yardstick.pipeline.run import Run
-from tests.pipeline.short_runs import spec_of
 
 LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 TRAIN = str(Path(__file__).parents[2] / "train.py")
@@ -148,23 +147,16 @@ def test_what_was_done():
     ]
 
 
-def test_what_to_type_next(monkeypatch, tmp_path):
+def test_what_to_type_next(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py"])
-    monkeypatch.chdir(tmp_path)
-    entry = {"env_kwargs": {"is_slippery": False}, "engine": "auto", "n_episodes": 30}
-    spec = spec_of("qlearning", "FrozenLake-v1", entry)
-    run = Run.claim(Path("else where"), spec)
-    chosen = "--algo qlearning --env FrozenLake-v1 -f 'else where'"
-    compared = "python compare.py --env FrozenLake-v1 --algos qlearning"
+    run = Run(Path("else where/qlearning/FrozenLake-v1_1"))
     explained, plain = (SimpleNamespace(can_be_explained=one) for one in (True, False))
-    assert next_commands(spec, run, explained) == [
-        ("watch", f"python enjoy.py {chosen}"),
-        ("explain", f"python -m rl_yardstick explain {chosen}"),
-        ("compare", f"{compared} --env-kwargs is_slippery:False --seeds 10 --engine auto"),
+    assert next_commands(run, [], explained) == [
+        f"watch    python enjoy.py '{run.path}'",
+        f"explain  python -m rl_yardstick explain '{run.path}'",
     ]
-    older = run
-    Run.claim(Path("else where"), spec)
-    assert next_commands(spec, older, plain)[0] == ("watch", f"python enjoy.py '{run.path}'")
+    (watched,) = next_commands(run, ["mine"], plain)
+    assert watched == f"watch    python enjoy.py '{run.path}' --gym-packages mine"
 
 
 # --- whole commands -------------------------------------------------------------------------------
