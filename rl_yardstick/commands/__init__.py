@@ -23,7 +23,6 @@ COMMANDS = {
     "inspect": "list the content of a model file without running any of it",
 }
 
-
 # For terminals that know ASCII alone.
 PLAIN = {"±": "+-", "…": "...", "∞": "inf", "×": "x", "–": "-", "━": "-"}  # noqa: RUF001
 

@@ -27,19 +27,17 @@ def main() -> int:
     """Print the help or the version; refuse what is no command."""
     from importlib.metadata import version
 
-    lines = [f"  {NAME} {command:<9}{summary}" for command, summary in COMMANDS.items()]
-    parser = OneLineParser(
-        prog=NAME,
-        usage=f"{NAME} [-h] [--version] COMMAND ...",
-        description="Tabular, bandit and deep reinforcement learning, measured by the optimum.",
-        epilog="\n".join(["commands:", *lines, "", f"Each has its own help: {NAME} train --help"]),
-    )
-    parser.add_argument("--version", action="version", version=version("rl-yardstick"))
-    parser.add_argument("command", nargs="?", metavar="COMMAND", help=" or ".join(COMMANDS))
-    given = parser.parse_args(sys.argv[1:2]).command
-    if given is None:
+    word = sys.argv[1] if len(sys.argv) > 1 else ""
+    if word == "--version":
+        sys.stdout.write(f"{version('rl-yardstick')}\n")
+    elif word in ("-h", "--help"):
+        lines = "".join(f"  {NAME} {each:<9}{summary}\n" for each, summary in COMMANDS.items())
+        sys.stdout.write(f"usage: {NAME} [-h] [--version] COMMAND ...\n\ncommands:\n{lines}")
+    elif not word:
         raise UserError(f"which command? {', '.join(COMMANDS)}")
-    raise unknown("unknown command", given, COMMANDS)
+    else:
+        raise unknown("unknown command", word, COMMANDS)
+    return 0
 
 
 def called_as(command: str) -> str:
@@ -66,12 +64,9 @@ def command_line() -> str:
 # The names of a flag, and argparse's options.
 Flag = tuple[list[str], dict[str, Any]]
 Flags = Mapping[str, Sequence[Flag]]  # by the title of their group
-Reader = Callable[[str], Any]
 
 
-def flag(
-    names: str, words: str, reader: Reader | None = None, default: Any = None, **options: Any
-) -> Flag:
+def flag(names: str, words: str, reader: Any = None, default: Any = None, **options: Any) -> Flag:
     """A flag: its names with spaces between them, its help, and the reader of its value."""
     read = {} if reader is None else {"type": reader, "metavar": "N"}
     return names.split(), {"help": words, "default": default, **read, **options}
@@ -162,10 +157,7 @@ LARGEST = 10**12
 def whole_number(
     least: int, most: int = LARGEST, besides: Mapping[int, str] | None = None
 ) -> Callable[[str], int]:
-    """A reader of whole numbers for argparse: ``100000``, ``100_000`` or ``1e5``.
-
-    It accepts numbers from ``least`` to ``most``, and the keys of ``besides`` (with meanings).
-    """
+    """A reader of whole numbers such as ``1e5``; ``besides`` maps further ones to meanings."""
     meanings = besides or {}
 
     def read(text: str) -> int:
@@ -289,15 +281,13 @@ def check_tensorboard(wanted: object) -> None:
 
 def check_device(device: str) -> None:
     """Raise `UserError` if PyTorch lacks the device; the library would silently use the CPU."""
-    if device in ("auto", "cpu"):
-        return
-    import torch as th
+    if device not in ("auto", "cpu"):
+        import torch as th
 
-    try:
-        th.zeros(1, device=device).item()
-    except (RuntimeError, AssertionError) as error:
-        text = f"--device: PyTorch has no {device!r} here: take 'auto' or 'cpu'"
-        raise UserError(text) from error
+        try:
+            th.zeros(1, device=device).item()
+        except (RuntimeError, AssertionError) as error:
+            raise UserError(f"--device: PyTorch has no {device!r} here") from error
 
 
 def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dict[str, Any]:
@@ -309,10 +299,6 @@ def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dic
     said = settings.get("engine", word)
     if said != word:
         raise UserError(f"--engine {word} and -params engine:{said} disagree: give one of them")
-    engines = [kind[1:] for kind in arguments_of(algo).get("engine", []) if kind.startswith("=")]
-    if word in engines:
-        return {**settings, "engine": word}
-    if not engines and word in ("auto", "library"):
-        return dict(settings)
-    has = f"the engines {', '.join(engines)}" if engines else "one engine, which auto means"
-    raise UserError(f"--engine {word}: {algo} has {has}")
+    if word in ("auto", "library") and "engine" not in arguments_of(algo):
+        return dict(settings)  # there is one engine
+    return {**settings, "engine": word}

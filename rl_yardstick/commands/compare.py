@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 EPILOG = """\
 examples:
   python compare.py --env FrozenLake-v1 --algos qlearning sarsa dqn ppo --seeds 10
-  python compare.py studies/warehouse-learning-rate.yml
   python compare.py studies/warehouse-learning-rate.yml --until-decided
   python compare.py --resume logs/studies/warehouse-learning-rate
   python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
@@ -268,8 +267,8 @@ def look_by_look(
             n_said = said.n_looks
             n = sum(pair.word == "undecided" for pair in said.pairs)
             told = f"{n} of {len(said.pairs)} pairs undecided" if n else "all pairs are decided"
-            n_seeds = record.looks[max(n_said - 1, 0)]
-            job.console.print(f"look {n_said} of {len(record.looks)}, at {n_seeds:,} seeds: {told}")
+            where = f"look {n_said} of {len(record.looks)}, at {record.looks[n_said - 1]:,} seeds"
+            job.console.print(f"{where}: {told}")
         if is_over:
             return results, said
         counts = {**counts, **next_counts(said)}
@@ -401,12 +400,11 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
 
     if not (args.env and args.algos):
         raise UserError("what to compare? give --env and --algos, or a study file")
-    for algo in args.algos:
-        check_agent(algo)
-    for env_id in args.env:
-        check_env_id(env_id)
-    if len({*args.env}) < len(args.env) or len({*args.algos}) < len(args.algos):
-        raise UserError("--env or --algos names one of them twice")
+    for check, names in ((check_agent, args.algos), (check_env_id, args.env)):
+        for name in names:
+            check(name)
+        if len(set(names)) < len(names):
+            raise UserError("--env or --algos names one of them twice")
     return StudySpec(
         name=file_name(f"{'-'.join(args.env).replace('/', '-')}_{'-'.join(args.algos)}"),
         title="",

@@ -29,7 +29,6 @@ examples:
   python enjoy.py --env Warehouse-v0 --algo ppo
   python enjoy.py --env Warehouse-v0 --algo sarsa --record route.gif --n-episodes 1
   python enjoy.py logs/dqn/CartPole-v1_3/rl_model_20000_steps.zip
-  python enjoy.py --algo ppo --env MountainCar-v0 -f rl-trained-agents
 """
 
 EXP_ID = whole_number(0, besides={-1: "the run without a number"})

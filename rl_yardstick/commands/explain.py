@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
-from rl_yardstick.commands.cli import OneLineParser, flag, shared, switch
+from rl_yardstick.commands.cli import OneLineParser, flag, shared
 from rl_yardstick.commands.enjoy import MODEL_FLAGS, found_model, wanted_model
 from rl_yardstick.pipeline.errors import UserError
 
@@ -38,7 +38,6 @@ def build_parser() -> OneLineParser:
         flag("--test", tested, nargs="*", action="append", metavar="KEY:VALUE"),
         flag("--against", "another agent: where the two part", Path, metavar="MODEL"),
         flag("--map", "draw the cost of each cell, as .png", Path, metavar="FILE"),
-        switch("--course", "also split the gap of each checkpoint of the run"),
         *shared("--jobs", "--json"),
     )
     words = "Show where an agent loses return against the optimum, exactly."
@@ -51,33 +50,25 @@ def main() -> int:
     """Explain an agent."""
     args = build_parser().parse_args()
     from rl_yardstick.commands.terminal import TextConsole, say
-    from rl_yardstick.report.why import as_words, course_lines, parting_lines, why_lines
-
-    def tell(lines: list[str]) -> None:
-        for line in lines:
-            say(console, line)
+    from rl_yardstick.report.why import as_words, parting_lines, why_lines
 
     console, wanted = TextConsole(), wanted_model(args)
     one = asked(console, wanted)
-    explained = one.explanation()
-    tell(why_lines(explained))
+    from rl_yardstick.diagnosis.explanation import explanation, parting
+
+    explained = explanation(*one.side)
+    say(console, "\n".join(why_lines(explained)))
     if explained.proposals and args.test is None:
         likeliest = ", ".join(f"--test {as_words(one)}" for one in explained.proposals[:2])
         say(console, f"to see what helps: {likeliest}, or --test alone")
     data = explained.as_data()
     if args.against is not None:
-        from rl_yardstick.diagnosis.explanation import parting
-
         other = asked(console, replace(wanted, path=args.against, algo=None, env_id=None))
         if one.evaluator.model.prob.shape != other.evaluator.model.prob.shape:
             raise UserError("--against: the two agents do not act on the same environment")
         found = parting(one.side, other.side)
-        tell(parting_lines(found))
+        say(console, "\n".join(parting_lines(found)))
         data["against"] = found.as_data()
-    if args.course:
-        course = course_of(one, explained)
-        tell(course_lines(course))
-        data["course"] = [{"timesteps": n, **each.as_data()} for n, each in course.items()]
     if args.map is not None:
         draw(one, explained, args.map)
         say(console, f"map: {args.map}")
@@ -103,34 +94,22 @@ class Asked:
         """What `parting` compares."""
         return self.found.spec, self.agent, self.evaluator
 
-    def explanation(self) -> Explanation:
-        """Where the agent loses return against the optimum."""
-        from rl_yardstick.diagnosis.explanation import explanation
-
-        return explanation(*self.side)
-
 
 def asked(console: Console, wanted: Wanted) -> Asked:
     """Find and load an agent, and compute the optimum of its environment."""
     found = found_model(console, median_run(wanted))
     with console.status("computing the optimum"):
         from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
+        from rl_yardstick.pipeline.models import load_agent
+        from rl_yardstick.pipeline.playing import playing_env
 
         spec = found.spec
         evaluator = exact_evaluator(spec)
         if evaluator is None:
             reason = model_refusal(spec) or f"the model of {spec.env_id} is not known"
             raise UserError(f"{reason}, so the gap to the optimum cannot be split")
-        return Asked(found, evaluator, loaded(found))
-
-
-def loaded(found: Model) -> BaseAlgorithm:
-    """The agent, on an environment that is closed again."""
-    from rl_yardstick.pipeline.models import load_agent
-    from rl_yardstick.pipeline.playing import playing_env
-
-    with closing(playing_env(found, None)) as env:
-        return load_agent(found, env)
+        with closing(playing_env(found, None)) as env:
+            return Asked(found, evaluator, load_agent(found, env))
 
 
 def median_run(wanted: Wanted) -> Wanted:
@@ -151,21 +130,6 @@ def median_run(wanted: Wanted) -> Wanted:
     place = Path(str(rows["path"].iloc[(len(rows) - 1) // 2]))  # the study may have been moved
     run = wanted.path.joinpath("runs", *place.parts[-2:])
     return replace(wanted, path=run, algo=None, env_id=None)
-
-
-def course_of(one: Asked, last: Explanation) -> dict[int, Explanation]:
-    """The explanation of each checkpoint of the run by its steps, and the last one."""
-    from rl_yardstick.pipeline.run import Run
-
-    saved = {} if one.found.run is None else Run(one.found.run).checkpoints()
-    if not saved:
-        raise UserError("--course: the run has no checkpoints; train it with --save-freq N")
-    course = {}
-    for path in saved.values():
-        then = replace(one, agent=loaded(replace(one.found, path=path)))
-        course[then.agent.num_timesteps] = then.explanation()
-    # A checkpoint has not learnt from its last step.
-    return {**course, one.agent.num_timesteps: last}
 
 
 def draw(one: Asked, explained: Explanation, path: Path) -> None:

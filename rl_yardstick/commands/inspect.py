@@ -7,8 +7,6 @@ from pathlib import Path
 from rl_yardstick.commands.cli import OneLineParser
 from rl_yardstick.pipeline.errors import UserError, one_line
 
-SUSPICIOUS = 1  # exit code
-
 
 def main() -> int:
     """Print the content of a model file and what is suspicious; return the exit code."""
@@ -34,4 +32,4 @@ def main() -> int:
         width = max(map(len, lines), default=0)
         rows = [f"  {name:<{width}}  {text}".rstrip() for name, text in lines.items()]
         say(console, "\n".join([title, *rows]))
-    return SUSPICIOUS if suspicious else 0
+    return int(bool(suspicious))

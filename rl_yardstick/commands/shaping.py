@@ -29,8 +29,6 @@ EPILOG = """\
 examples:
   python -m rl_yardstick shaping --env Warehouse-v0 --algo ppo
   python -m rl_yardstick shaping --env Warehouse-v0 --train-env-kwargs goal_reward:5
-  python -m rl_yardstick shaping --env FrozenLake-v1 \\
-    --wrapper rl_yardstick.envs.wrappers.TerminationReward reward:-1
 """
 
 
@@ -199,8 +197,6 @@ class Compared:
                 "discount": discount,
                 "time_limit": None if discount < 1 else self.horizon,
                 "same": found.is_same,
-                "n_states": int(self.model.reachable.sum()),
-                "n_differing": int(found.differs.sum()),
                 "cost": [found.optimum - each for each in found.returns],
                 "states": self.places(found),
             }

@@ -85,7 +85,8 @@ def result_lines(evaluation: Evaluation, *more: str) -> list[str]:
 
 def judged(value: float, yardstick: Yardstick | None, n_episodes: int = 0) -> list[str]:
     """The score of a return and the return; with 0 episodes it is exact."""
-    notes = [f"sampled, {episodes(n_episodes)}"] if n_episodes else []
+    count = f"{n_episodes:,} episode{'s' * (n_episodes > 1)}"
+    notes = [f"sampled, {count}"] if n_episodes else []
     if yardstick is None:
         return [_returned(value, None, notes)]
     if not yardstick.is_proven:
@@ -164,8 +165,3 @@ def percent(share: float) -> str:
     """A share in percent, of which only all is 100 %."""
     most = 100.0 if share > 1 - ROUNDING else 99.9
     return f"{min(round(100 * share, 1), most):g} %"
-
-
-def episodes(n: int) -> str:
-    """A number of episodes in words."""
-    return f"{n:,} episode{'s' if n != 1 else ''}"

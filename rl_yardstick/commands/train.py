@@ -39,7 +39,6 @@ EPILOG = """\
 examples:
   python train.py --env Warehouse-v0 --algo ppo --engine auto
   python train.py --env FrozenLake-v1 --algo qlearning --n-episodes 5000 --seed 0
-  python train.py --env Warehouse-v0 --algo sarsa --env-kwargs shelf_reward:-1 slip:0.1
   python train.py --resume logs/ppo/Warehouse-v0_3
   python train.py --list
 """
@@ -251,10 +250,9 @@ def unfinished_run(args: argparse.Namespace) -> Path:
     if not args.resume:
         over = (None, "finished")
         found = newest_run(args, lambda run: run.recorded().get("state") not in over)
-        if found is None:
-            where = f"{args.log_folder} has no unfinished run"
-            raise UserError(f"{where} of {args.algo} on {args.env}")
-        return found
+        if found is not None:
+            return found
+        raise UserError(f"{args.log_folder} has no unfinished run of {args.algo} on {args.env}")
     if not Path(args.resume).is_dir():
         raise UserError(f"{args.resume}: there is no such run folder")
     return Path(args.resume)
@@ -314,16 +312,13 @@ def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Outcome)
         say(console, f"{label:<9}{text}")
     results = [] if outcome.pulls is None else [describe_pulls(outcome.pulls)]
     results += [] if outcome.final is None else result_lines(outcome.final)
-    for line in [""] * bool(results) + results:
-        say(console, line)
+    say(console, "\n".join(["", *results]) if results else "")
     if outcome.advice is not None:
         console.print(f"instead  {outcome.advice.instead}")
         if outcome.advice.try_first:
             console.print(f"try      {outcome.advice.try_first}")
         say(console, "more     docs/not-learning.md")
-    say(console, "")
-    for line in next_commands(run, spec.gym_packages, outcome):
-        say(console, line)
+    say(console, "\n".join(["", *next_commands(run, spec.gym_packages, outcome)]))
     if outcome.watch is not None and spec.watch_learning is not None and outcome.watch.has_begun:
         from rl_yardstick.report.page.learning import write_learning_page
 
@@ -418,7 +413,4 @@ def print_lists() -> None:
             table.add_row(*row)
         console.print(table)
         console.print()
-    console.print(
-        "Any other environment registered with Gymnasium works where the spaces fit; "
-        "--gym-packages imports modules that register more, and agents of your own."
-    )
+    console.print("Any environment of Gymnasium works where the spaces fit; see --gym-packages.")

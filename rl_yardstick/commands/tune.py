@@ -97,8 +97,7 @@ FLAGS: Flags = {
         flag("--name --study-name", "name of the search's folder", cli.folder_name, metavar="NAME"),
         flag(FOLDER, "folder of all searches (logs/tuning)", default="logs/tuning"),
         switch("--no-report --no-optim-plots", "only tables: no figures and no page"),
-        # Users of rl_zoo3 type it; this command always does what it asks for.
-        switch("-optimize --optimize-hyperparameters", argparse.SUPPRESS),
+        switch("-optimize --optimize-hyperparameters", argparse.SUPPRESS),  # rl_zoo3's
     ),
 }
 
@@ -237,9 +236,8 @@ def retested(
     from rl_yardstick.tuning.retesting import FOLDER, concluded, is_settled, retest_study
 
     tuning, again = search.tuning, replace(job, root=job.root / FOLDER)
-    study = retest_study(tuning, job.root, chosen)
-    is_growing, most = tuning.until_decided, tuning.max_retest_seeds
-    looks = plan_of_looks(study, again.root, most) if is_growing else ()
+    study, most = retest_study(tuning, job.root, chosen), tuning.max_retest_seeds
+    looks = plan_of_looks(study, again.root, most) if tuning.until_decided else ()
     record = StudyRecord(study, specs_of(study), looks)
     with held(again.root):
         record.write(again.root)
@@ -282,9 +280,6 @@ def print_opened(job: Job, search: Search) -> None:
     say(job.console, f"{words}, in {job.root}")
     if mark := unproven_mark(search.tuning):
         say(job.console, f"scores are{mark}")
-    if suggestions.fits_batches:
-        text = "batch_size: the nearest number that divides n_steps times n_envs is tried"
-        say(job.console, text)
     for name in suggestions.space.widened:
         say(job.console, f"{name}: the search space is widened to hold the shipped value")
 
@@ -302,11 +297,9 @@ def print_search(console: Console, search: Search) -> None:
     spent = f"{sum(run.seconds for run in runs):,.0f} s of processor time"
     say(console, f"trials: {counts}; {len(runs)} of {n_runs} runs, {spent}")
     if (n := search.n_at_optimum) > 1:
-        text = f"{n} settings have the optimum on all seeds: they are ranked by steps to the "
-        text += "threshold"
+        say(console, f"{n} settings have the optimum on all seeds: the fastest are the best")
         if search.is_saturated and not search.is_done:
-            text += "; the search ends here (--metric steps searches for the fastest)"
-        say(console, text)
+            say(console, "the search ends here (--metric steps searches for the fastest)")
 
 
 def print_outcome(console: Console, outcome: Outcome) -> None:

@@ -1,15 +1,11 @@
-"""Reads members and settings from zips of models, without importing the libraries.
-
-It unpacks no more bytes than the budget of the file allows.
-"""
+"""Reads members and settings from zips of models, without importing the libraries."""
 
 from __future__ import annotations
 
 import io
 import json
 import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 from rl_yardstick.safe_files.files import Budget, UnsafeFileError, shown
@@ -26,47 +22,37 @@ _COPIES = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 2}
 
 
 def read_members(content: bytes, budget: Budget | None = None) -> dict[str, bytes]:
-    """Read the members of a zip, by name."""
+    """Read the members of a zip, stored or deflated, by name, within the budget."""
     budget = budget or Budget(len(content))
-    with opened_zip(content, budget) as archive:
-        infos = archive.infolist()
-        budget.charge(sum(info.file_size * _COPIES[info.compress_type] for info in infos))
-        return {info.filename: read_member(archive, info) for info in infos}
+    budget.charge(content.count(_ENTRY) * _BYTES_PER_ENTRY)
+    members = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            infos = archive.infolist()
+            if any(info.compress_type not in _COPIES for info in infos):
+                raise UnsafeFileError("has a compression method that is not read here")
+            budget.charge(sum(info.file_size * _COPIES[info.compress_type] for info in infos))
+            for info in infos:
+                with archive.open(info) as member:  # may hold more than it declares
+                    members[info.filename] = member.read(info.file_size)
+                if len(members[info.filename]) != info.file_size:
+                    raise UnsafeFileError(f"{shown(info.filename)} is cut off")
+    except UnsafeFileError:
+        raise
+    except Exception as error:  # damaged, encrypted, or of an unknown kind
+        raise UnsafeFileError(f"is no whole zip: {error}") from error
+    return members
 
 
 def read_model_members(content: bytes, budget: Budget) -> dict[str, bytes]:
     """Read the members of a model's zip; refuses others than models have."""
     members = read_members(content, budget)
-    strange = [name for name in members if name not in _TEXTS and not name.endswith(TENSORS)]
-    if strange:
-        raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
+    for name in members:
+        if name not in _TEXTS and not name.endswith(TENSORS):
+            raise UnsafeFileError(f"holds {shown(name)}, which no model file has")
     if SETTINGS not in members or not any(name.endswith(TENSORS) for name in members):
         raise UnsafeFileError("lacks parts that a model has")
     return members
-
-
-def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """Read a member of a zip; unpacks no more than the member's declared size."""
-    with archive.open(info) as member:
-        content = member.read(info.file_size)
-    if len(content) != info.file_size:
-        raise UnsafeFileError(f"{shown(info.filename)} is cut off")
-    return content
-
-
-@contextmanager
-def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
-    """Open a zip, stored or deflated."""
-    budget.charge(content.count(_ENTRY) * _BYTES_PER_ENTRY)
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if any(info.compress_type not in _COPIES for info in archive.infolist()):
-                raise UnsafeFileError("has a compression method that is not read here")
-            yield archive
-    except UnsafeFileError:
-        raise
-    except Exception as error:  # damaged, encrypted, or of an unknown kind
-        raise UnsafeFileError(f"is no whole zip: {error}") from error
 
 
 def first_look(content: bytes) -> dict[str, Any]:

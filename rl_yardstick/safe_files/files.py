@@ -12,11 +12,8 @@ from pathlib import Path
 NO_LIMIT = 1 << 62  # bytes
 # A model of a hundred million parameters is larger than any that these algorithms train.
 MAX_ARCHIVE_BYTES = 1 << 30
-MAX_STATISTICS_BYTES = 64 << 20
-MAX_BUFFER_BYTES = 32 << 30
 # Reading a file may take this multiple of its size, plus these bytes.
-_TIMES = 5
-_FREE_BYTES = 64 << 20
+_TIMES, _FREE_BYTES = 5, 64 << 20
 # An empty dictionary and its slot in a container: no value takes more in addition to its text.
 _BYTES_PER_JSON_VALUE = 100
 
@@ -25,16 +22,11 @@ Source = Path | str | io.BufferedIOBase
 
 
 class UnsafeFileError(ValueError):
-    """A file has forbidden contents, is damaged, or is too large; the message is one line.
-
-    Attributes:
-        key: the faulty entry of a model file, or None.
-    """
+    """A file is forbidden, damaged or too large; ``key`` is a model's faulty entry, or None."""
 
     def __init__(self, message: str, key: str | None = None) -> None:
-        # Control characters are escaped.
-        signs = (c if c.isprintable() else repr(c)[1:-1] for c in " ".join(message.split()))
-        super().__init__("".join(signs))
+        line = " ".join(message.split())
+        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in line))
         self.key = key
 
 
@@ -54,9 +46,8 @@ class Budget:
         """Charge ``n_bytes``; raises UnsafeFileError if fewer are left."""
         self.left -= n_bytes
         if self.left < 0:
-            raise UnsafeFileError(
-                f"would take more memory than {_TIMES} times its size and {_FREE_BYTES >> 20} MB"
-            )
+            most = f"{_TIMES} times its size and {_FREE_BYTES >> 20} MB"
+            raise UnsafeFileError(f"would take more memory than {most}")
 
     def charge_json(self, text: bytes) -> None:
         """Charge the memory of parsing a JSON text; see `charge`."""

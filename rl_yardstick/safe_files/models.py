@@ -1,8 +1,7 @@
 """Loads models of Stable-Baselines3 and sb3-contrib from files of unknown origin.
 
 The library's own `load` gets a new zip with the checked contents, so it has nothing to unpickle.
-This module also checks sizes, because `load` would make networks and buffers of any size in the
-settings.
+Sizes are checked, because it would make networks and buffers of any size in the settings.
 """
 
 from __future__ import annotations
@@ -48,9 +47,6 @@ from rl_yardstick.safe_files.known_objects import (
 )
 from rl_yardstick.safe_files.pickles import Reader
 
-# Files of trained variables outside networks; the second name is the older one.
-_VARIABLES = ("pytorch_variables.pth", "tensors.pth")
-
 # Attributes that models do not keep: the caller sets them, regardless of the file.
 _NOT_KEPT = frozenset(
     {"env", "device", "policy", "rollout_buffer", "replay_buffer", "_logger", "_custom_logger"}
@@ -59,9 +55,6 @@ _NOT_KEPT = frozenset(
 # The caller's as well, or rebuilt from the learning rate and the exploration settings.
 _NOT_READ = _NOT_KEPT | {"tensorboard_log", "lr_schedule", "exploration_schedule"}
 _SERIALIZED = ":serialized:"
-
-# Types of a class's default value of an attribute.
-_PLAIN = (bool, int, float, str, type(None))
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
@@ -76,7 +69,7 @@ def load_model(
     custom_objects: Mapping[str, Any] | None = None,
     **replaced: Any,
 ) -> Algorithm:
-    """Like ``algorithm.load``, but runs no code from the file.
+    """Like ``algorithm.load`` of a path or a stream, but runs no code from the file.
 
     Args:
         algorithm: a class of Stable-Baselines3, sb3-contrib, or your own with the same interface.
@@ -85,7 +78,7 @@ def load_model(
         device: the device of the tensors.
         classes: your own classes that the file may name, by their full names.
         custom_objects: values that replace attributes in the file, which are then not read.
-        replaced: attributes to set, also if the file lacks them; the file's values are not read.
+        replaced: the same, also for attributes that the file lacks.
 
     Raises:
         UnsafeFileError: if the file has forbidden contents, is damaged, or is too large.
@@ -94,7 +87,11 @@ def load_model(
     content = content_of(path, MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
     members = read_model_members(content, budget)
-    settings = _read_settings(members, algorithm, budget)
+    raw = parse_settings(members, budget)
+    settings = {key: _decoded(value) for key, value in raw.items() if key not in _NOT_READ}
+    for key in settings:
+        if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
+            raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
     known = {**by_name(algorithm.policy_aliases.values()), **(classes or {})}
     objects = {name: held for name, held in (custom_objects or {}).items() if name in settings}
     pickled = {name: held for name, held in settings.items() if isinstance(held, bytes)}
@@ -120,21 +117,10 @@ def load_model(
         raise UnsafeFileError(f"holds no such model: {reason}") from error
 
 
-def _read_settings(
-    members: Mapping[str, bytes], algorithm: type[BaseAlgorithm], budget: Budget
-) -> dict[str, Any]:
-    """The attributes in a zip; pickles are bytes."""
-    settings = parse_settings(members, budget)
-    read = {key: _decoded(value) for key, value in settings.items() if key not in _NOT_READ}
-    for key in read:
-        if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
-            raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
-    return read
-
-
 def hides(algorithm: type, name: str) -> bool:
     """Whether an attribute of that name would hide a class member other than a plain default."""
-    return not isinstance(inspect.getattr_static(algorithm, name, None), _PLAIN)
+    default = inspect.getattr_static(algorithm, name, None)
+    return not isinstance(default, bool | int | float | str | None)
 
 
 def _decoded(value: Any) -> Any:
@@ -153,7 +139,7 @@ def _check_variables(tensors: Mapping[str, Any], algorithm: type[BaseAlgorithm])
     # For the libraries' classes, an empty instance is enough, or these are the variables.
     with contextlib.suppress(AttributeError):
         known |= set(algorithm._get_torch_save_params(algorithm.__new__(algorithm))[1])
-    for name in _VARIABLES:
+    for name in ("pytorch_variables.pth", "tensors.pth"):  # the second is the older one
         for key in tensors.get(name, {}):
             if key not in known:
                 raise UnsafeFileError(f"sets {shown(key)}, which is no variable of a model")
@@ -180,8 +166,7 @@ _MAKERS = frozenset(
     {th.empty, th.zeros, th.ones, th.full, th.rand, th.randn, th.eye, th.arange, th.Tensor.repeat}
     | {th.empty_like, th.zeros_like, th.ones_like, th.Tensor.clone, th.clone}
 )
-# Python's overhead of a tensor and its layer.
-_BYTES_PER_TENSOR = 4096
+_BYTES_PER_TENSOR = 4096  # Python's overhead of a tensor and its layer
 
 
 class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a function is
@@ -224,28 +209,26 @@ def inspect_model(path: Path | str) -> dict[str, dict[str, str]]:
     content = read_file(Path(path), MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
     members = read_model_members(content, budget)
-    found: dict[str, dict[str, str]] = {"members": {}, "weights": {}, "settings": {}}
-    doubts: dict[str, str] = {}
+    titles = ("members", "weights", "settings", "suspicious")
+    found: dict[str, dict[str, str]] = {title: {} for title in titles}
     for key, value in parse_settings(members, budget).items():
+        name = shown(key)[1:-1]
         try:
-            found["settings"][_quoted(key)] = _setting(key, value, budget)
+            found["settings"][name] = _setting(key, value, budget)
         except UnsafeFileError as error:
-            doubts[_quoted(key)] = str(error)
-    for name, held in members.items():
-        found["members"][_quoted(name)] = f"{len(held):,} bytes"
+            found["suspicious"][name] = str(error)
+    for member, held in members.items():
+        name = shown(member)[1:-1]
+        found["members"][name] = f"{len(held):,} bytes"
         try:
-            is_tensors, stem = name.endswith(TENSORS), name.removesuffix(TENSORS)
-            tensors = {stem: load_tensors(held, budget)} if is_tensors else {}
+            stem = member.removesuffix(TENSORS)
+            tensors = {stem: load_tensors(held, budget)} if stem != member else {}
             check_values(tensors)
             for where, tensor in tensors_in(tensors):
-                found["weights"][_quoted(where)] = str(tuple(tensor.shape))
+                found["weights"][shown(where)[1:-1]] = str(tuple(tensor.shape))
         except UnsafeFileError as error:
-            doubts[_quoted(name)] = str(error)
-    return {**found, "suspicious": doubts}
-
-
-def _quoted(name: str) -> str:
-    return shown(name).strip("'")
+            found["suspicious"][name] = str(error)
+    return found
 
 
 def _setting(key: str, value: Any, budget: Budget) -> str:
@@ -257,7 +240,7 @@ def _setting(key: str, value: Any, budget: Budget) -> str:
         return shown(value)
     reader = Reader(io.BytesIO(pickled), budget)
     reader.load()
-    names = [_quoted(name) for name in sorted(reader.names)]
+    names = [shown(name)[1:-1] for name in sorted(reader.names)]
     if key != "policy_class" or not names[0].startswith(("stable_baselines3.", "sb3_contrib.")):
         read_pickle(pickled, budget=budget)
     return "a pickle of " + (", ".join(names) or "plain data")

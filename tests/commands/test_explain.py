@@ -53,13 +53,12 @@ def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, r
     assert "16 runs, 16 of them there already" in type_command("explain", run, *words)[1]
 
 
-def test_checkpoints_show_the_course_and_two_agents_where_they_part(type_command, run, tmp_path):
+def test_two_agents_where_they_part(type_command, run, tmp_path):
     last = f"{run}/rl_model_1000_steps.zip"
-    words = ("--course", "--against", last, "--map", "costs.png", "--json", "why.json")
+    words = ("--against", last, "--map", "costs.png", "--json", "why.json")
     code, out, _ = type_command("explain", run, *words)
     data = json.loads(Path("why.json").read_text())
     assert code == 0
-    assert [row["timesteps"] for row in data["course"]] == [1000, 2000, 3000]
     assert sum(place["gain"] for place in data["against"]["places"]) == pytest.approx(
         data["against"]["difference"]
     )
@@ -72,7 +71,7 @@ def test_what_cannot_be_explained_is_refused_in_one_line(type_command, run):
     for words, line in (
         ([run, "--test", "gama:0.9"], "gama"),
         ([run, "--map", "costs.svg"], "--map writes a .png"),
-        ([cart, "--course"], "the model of CartPole-v1 is not known"),
+        ([cart], "the model of CartPole-v1 is not known"),
     ):
         code, _, err = type_command("explain", *words)
         assert (code, err.count("\n")) == (2, 1)
