@@ -23,7 +23,7 @@ from rl_yardstick.envs.finite_env import (
     summing_to_one,
 )
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints, TransitionModel
-from rl_yardstick.safe_files.files import UnsafeFileError, read_file
+from rl_yardstick.safe_files.files import UnsafeFileError, content_of
 
 START = "S"
 GOAL = "G"
@@ -135,7 +135,7 @@ def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
 def read_rows(desc: Description) -> tuple[str, ...]:
     """The rows of a map, not checked yet; see `GridMap.read`."""
     if _is_path(desc):
-        text = _read_file(Path(desc))
+        text = _content_of(Path(desc))
     elif isinstance(desc, str):
         text = desc
     elif isinstance(desc, Sequence) and all(isinstance(row, str) for row in desc):
@@ -152,9 +152,9 @@ def _is_path(desc: Description) -> TypeGuard[str | os.PathLike[str]]:
     return isinstance(desc, os.PathLike) or (isinstance(desc, str) and "\n" not in desc)
 
 
-def _read_file(path: Path) -> str:
+def _content_of(path: Path) -> str:
     try:
-        return read_file(path, MAX_MAP_BYTES).decode("utf-8-sig")
+        return content_of(path, MAX_MAP_BYTES).decode("utf-8-sig")
     except (OSError, UnsafeFileError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ValueError(f"desc: cannot read the map file {path}: {reason}") from error

@@ -86,7 +86,7 @@ def read_arrays(
     """
     from numpy.lib.format import read_array
 
-    from rl_yardstick.safe_files.archives import read_members
+    from rl_yardstick.safe_files.files import read_members
 
     found: dict[str, NDArray[Any]] = {}
     lengths: dict[str, int] = {}

@@ -188,7 +188,7 @@ def zip_data(path: Path) -> dict[str, Any]:
     Raises:
         UserError: if the file is no whole zip of an agent.
     """
-    from rl_yardstick.safe_files.archives import first_look
+    from rl_yardstick.safe_files.files import first_look
 
     content = read_bytes(path, MAX_MODEL)
     try:

@@ -63,7 +63,6 @@ def load_replay_buffer(
 
 # --- statistics -----------------------------------------------------------------------------------
 
-_VEC_NORMALIZE = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
 _SETTINGS = ["training", "norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon"]
 _REST = ("observation_space", "obs_rms", "ret_rms")
 
@@ -97,7 +96,7 @@ def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
 
 def read_normalization(pickled: bytes) -> Normalization:
     """Read the statistics in a pickled `VecNormalize`."""
-    found = read_pickle(pickled, makers={_VEC_NORMALIZE: _normalization})
+    found = read_pickle(pickled, makers=dict.fromkeys(by_name([VecNormalize]), _normalization))
     if not isinstance(found, Normalization):
         raise UnsafeFileError("holds no statistics of VecNormalize")
     return found

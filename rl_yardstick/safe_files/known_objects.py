@@ -27,8 +27,7 @@ from torch.distributions.transforms import AffineTransform, ComposeTransform, Ex
 from torch.nn.modules import activation
 
 from rl_yardstick.safe_files import pickles
-from rl_yardstick.safe_files.archives import read_members
-from rl_yardstick.safe_files.files import Budget, UnsafeFileError, shown
+from rl_yardstick.safe_files.files import Budget, UnsafeFileError, read_members, shown
 from rl_yardstick.safe_files.pickles import Build, Made, Maker, fields, pairs, wrong
 
 
@@ -67,8 +66,7 @@ def _array(data: Any, dtype: Any, shape: Any, order: Any = "C") -> NDArray[Any]:
     if isinstance(data, list) is not dtype.hasobject:
         raise TypeError("an array of objects has a list of them, others have bytes")
     flat = np.fromiter(data, object) if dtype.hasobject else np.frombuffer(data, dtype)
-    # A copy, because an array on bytes is read-only.
-    return flat.reshape(shape, order=order).copy(order=order)
+    return flat.reshape(shape, order=order).copy(order=order)  # an array on bytes is read-only
 
 
 def _from_buffer(made: Made, build: Build) -> NDArray[Any]:

@@ -11,6 +11,8 @@ import contextlib
 import inspect
 import io
 import json
+import os
+import sys
 import textwrap
 import zipfile
 from collections.abc import Mapping
@@ -22,22 +24,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from torch.overrides import TorchFunctionMode
 
-from rl_yardstick.safe_files.archives import (
-    SETTINGS,
-    TENSORS,
-    parse_settings,
-    read_model_members,
-)
-from rl_yardstick.safe_files.files import (
-    MAX_ARCHIVE_BYTES,
-    Budget,
-    Source,
-    UnsafeFileError,
-    content_of,
-    memory_bytes,
-    read_file,
-    shown,
-)
+from rl_yardstick.safe_files import files
+from rl_yardstick.safe_files.files import SETTINGS, TENSORS, Budget, Source, UnsafeFileError, shown
 from rl_yardstick.safe_files.known_objects import (
     by_name,
     check_values,
@@ -84,10 +72,10 @@ def load_model(
         UnsafeFileError: if the file has forbidden contents, is damaged, or is too large.
         ValueError: if the model does not fit ``env``; the message is the library's.
     """
-    content = content_of(path, MAX_ARCHIVE_BYTES)
+    content = files.content_of(path, files.MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
-    members = read_model_members(content, budget)
-    raw = parse_settings(members, budget)
+    members = files.read_model_members(content, budget)
+    raw = files.parse_settings(members, budget)
     settings = {key: _decoded(value) for key, value in raw.items() if key not in _NOT_READ}
     for key in settings:
         if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
@@ -107,7 +95,14 @@ def load_model(
         _check_variables(tensors, algorithm)
         _check_buffers({**settings, **objects, **replaced})
         # The library applies only custom objects whose keys are in the file.
-        checked = _zipped({**settings, **dict.fromkeys([*pickled, *objects])}, tensors)
+        data = {**settings, **dict.fromkeys([*pickled, *objects])}
+        checked = io.BytesIO()
+        with zipfile.ZipFile(checked, "w") as archive:
+            archive.writestr(SETTINGS, json.dumps(data))
+            for name in names:  # what is written needs no second place in memory
+                with archive.open(name, "w") as member:
+                    th.save(tensors.pop(name), member)
+        checked.seek(0)
         with charged_tensors(budget):
             return algorithm.load(checked, env, device, objects, **replaced)
     except ValueError:
@@ -145,18 +140,6 @@ def _check_variables(tensors: Mapping[str, Any], algorithm: type[BaseAlgorithm])
                 raise UnsafeFileError(f"sets {shown(key)}, which is no variable of a model")
 
 
-def _zipped(data: Mapping[str, Any], tensors: dict[str, Any]) -> io.BytesIO:
-    """Write a new zip of the checked contents; takes the tensors from the dictionary."""
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
-        archive.writestr(SETTINGS, json.dumps(data))
-        for name in list(tensors):
-            with archive.open(name, "w") as member:
-                th.save(tensors.pop(name), member)
-    content.seek(0)
-    return content
-
-
 # --- sizes ----------------------------------------------------------------------------------------
 
 # Bytes of a number in a buffer, and of the dictionary that `HerReplayBuffer` keeps for each step.
@@ -176,23 +159,25 @@ class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a funct
         super().__init__()
         self.budget = budget
 
-    def __torch_function__(
-        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if function in _MAKERS:
+        if func in _MAKERS:
             # PyTorch's device for tensors without memory.
             like = [arg.to("meta") if isinstance(arg, th.Tensor) else arg for arg in args]
             where = {} if like and isinstance(like[0], th.Tensor) else {"device": "meta"}
-            self.budget.charge(function(*like, **{**kwargs, **where}).nbytes + _BYTES_PER_TENSOR)
-        return function(*args, **kwargs)
+            self.budget.charge(func(*like, **{**kwargs, **where}).nbytes + _BYTES_PER_TENSOR)
+        return func(*args, **kwargs)
 
 
 def _check_buffers(settings: Mapping[str, Any]) -> None:
     """Check that the buffers in the settings fit into memory."""
+    most = 16 << 30  # bytes, if the system does not report its memory
+    if sys.platform != "win32":
+        with contextlib.suppress(ValueError, OSError):
+            most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     row = get_flattened_obs_dim(settings["observation_space"]) * _BYTES_PER_NUMBER + _BYTES_PER_INFO
     for name, factor in (("buffer_size", 1), ("n_steps", settings.get("n_envs", 1))):
-        if not 0 < settings.get(name, 1) * factor * row <= memory_bytes():
+        if not 0 < settings.get(name, 1) * factor * row <= most:
             raise UnsafeFileError(f"does not fit into memory here: give another {name}", name)
 
 
@@ -206,12 +191,12 @@ def inspect_model(path: Path | str) -> dict[str, dict[str, str]]:
         for each of ``"members"``, ``"weights"``, ``"settings"`` and ``"suspicious"``, texts of one
         line by name.
     """
-    content = read_file(Path(path), MAX_ARCHIVE_BYTES)
+    content = files.content_of(path, files.MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
-    members = read_model_members(content, budget)
-    titles = ("members", "weights", "settings", "suspicious")
-    found: dict[str, dict[str, str]] = {title: {} for title in titles}
-    for key, value in parse_settings(members, budget).items():
+    members = files.read_model_members(content, budget)
+    found: dict[str, dict[str, str]] = {"members": {}, "weights": {}, "settings": {}}
+    found["suspicious"] = {}
+    for key, value in files.parse_settings(members, budget).items():
         name = shown(key)[1:-1]
         try:
             found["settings"][name] = _setting(key, value, budget)

@@ -29,8 +29,7 @@ INSTRUCTIONS = frozenset(_NAMES.split())
 # of a sign, since one can make all others of a text four bytes wide.
 _PRICE, _BYTES_PER_SIGN = 160, 4
 MAX_DEPTH, MAX_INTEGER_BITS = 40, 128
-# Larger integers are not their own hash, so that any number of them can share one.
-_END_OF_KEYS = (1 << 61) - 1
+_END_OF_KEYS = (1 << 61) - 1  # larger integers are not their own hash: any number can share one
 # Packages that were renamed: NumPy's inner one, and Gym, whose spaces Gymnasium took over.
 _RENAMED = {"numpy.core.": "numpy._core.", "gym.spaces.": "gymnasium.spaces."}
 # The names of records of dictionaries and of persistent ids. Names in a file have a dot.
@@ -134,10 +133,7 @@ Maker = Callable[[Made, "Build"], Any]
 
 @dataclass
 class Build:
-    """Builds values from records, by tables of makers and classes with the full names in the file.
-
-    A shared part is built, and charged, at each of its places.
-    """
+    """Builds values from records, a shared part at each of its places, by tables of full names."""
 
     makers: Mapping[str, Maker]
     classes: Mapping[str, type]
