@@ -284,7 +284,7 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     unit = "steps" if spec.n_timesteps else "episodes"
     budget = spec.n_timesteps or spec.n_episodes or 0
     say(console, f"{spec.algo} on {spec.place}, seed {spec.seed}, {budget:,} {unit}", "bold")
-    plain, explained = [], []
+    plain, explained = list[str](), list[str]()
     for key, value in spec.hyperparams.items():
         if key == "policy" and not str(value).startswith(("Mlp", "Cnn", "MultiInput")):
             continue  # our tables and bandits have one each
