@@ -182,7 +182,6 @@ def _training(env_id: str, algo: str, steps: int, settings: str) -> list[str]:
 
 def _others(folder: Path) -> list[Case]:
     study = f"compare.py {STUDY} --name study -n 1500".split()
-    older = f"compare.py {STUDY} --name study -n 1000".split()
     films = f"compare.py {FILMS} --n-episodes 200 --render-every 20".split()
     agent = f"train.py {LAKE} -n 20000 --seed 1 --verbose 0".split()
     film = f"enjoy.py {LAKE} --record {{logs}}/film.gif --reward-log {{logs}}/returns".split()
@@ -193,7 +192,6 @@ def _others(folder: Path) -> list[Case]:
     logged = ["compare.py", "--logged", "{before}-1.csv", "--policy", *names]
     return [
         Case("a study of 12 runs", folder / "study", study),
-        Case("a study --replace", folder / "replace", [*study, "--replace"], (older,), True),
         Case("a study with films", folder / "films", films),
         Case("enjoy --record", folder / "record", film, (agent,), begins_with_them=True),
         Case(

@@ -26,8 +26,8 @@ os.environ.update(OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
 import numpy as np
 from numpy.typing import NDArray
 
-from rl_yardstick.commands.engines import NETWORKS
 from rl_yardstick.commands.train import build_parser, spec_from_flags
+from rl_yardstick.experiments.plan import NETWORKS
 from rl_yardstick.pipeline.environments import make_evaluation_env
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.sampled import SampledEvaluator

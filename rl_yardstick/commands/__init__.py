@@ -23,7 +23,6 @@ COMMANDS = {
     "inspect": "list the content of a model file without running any of it",
 }
 
-
 # For terminals that know ASCII alone.
 PLAIN = {"±": "+-", "…": "...", "∞": "inf", "×": "x", "–": "-", "━": "-"}  # noqa: RUF001
 
@@ -41,7 +40,7 @@ def main() -> NoReturn:
     """``yardstick COMMAND`` and ``python -m rl_yardstick COMMAND``."""
     command = sys.argv[1] if len(sys.argv) > 1 else ""
     if command not in COMMANDS:
-        run_command("help")
+        run_command("cli")
     sys.argv = [f"{NAME} {command}", *sys.argv[2:]]
     run_command(command)
 

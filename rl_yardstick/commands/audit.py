@@ -5,16 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 import textwrap
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rl_yardstick.commands.cli import (
-    OneLineParser,
-    add_shared,
-    filled,
-    whole_number,
-    with_engine,
-)
+from rl_yardstick.commands.cli import OneLineParser, flag, shared, whole_number, with_engine
 from rl_yardstick.diagnosis.faults import FAULTS, KINDS
 from rl_yardstick.pipeline.errors import UserError
 
@@ -27,7 +20,6 @@ WORDS = {"ok": "ok", "fault": "FAULT", "unsaid": "nothing can be said", "skipped
 EPILOG = """\
 examples:
   python -m rl_yardstick audit --algo qlearning
-  python -m rl_yardstick audit --algo ppo -params n_epochs:5
   python -m rl_yardstick audit --algo my_agents:MyQLearning --kind q_learning
   python -m rl_yardstick audit --script my_script:train --kind sarsa
 
@@ -38,38 +30,28 @@ Exit code: 0 if it is right, 1 if it has a fault, 2 if nothing can be said.
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> OneLineParser:
     """The flags."""
-    parser = OneLineParser(
-        description="Test an implementation for known bugs, on tiny worlds with exact values.",
-        epilog=EPILOG,
+    words = "Test an implementation for known bugs, on tiny worlds with exact values."
+    spaces = ("discrete", "box")
+    flags = (
+        *shared("--gym-packages", "--engine", "--hyperparams"),
+        flag("--kind", "the kind of algorithm (default: as its class)", choices=[*KINDS]),
+        flag("--observations", "numbers or vectors (default: what works)", choices=spaces),
+        flag("--actions", "one of two, or a number (default: what works)", choices=spaces),
+        flag("--seeds", "seeds for a probe that fails: the majority", whole_number(1, 100), 3),
+        *shared("--json"),
     )
+    parser = OneLineParser(words, EPILOG, {"": flags})
     what = parser.add_mutually_exclusive_group(required=True)
-    algo = "agent (see train.py --list), or a class of yours as module:Class"
-    what.add_argument("--algo", type=filled, help=algo)
-    script = "a function that trains, as module:function"
-    what.add_argument("--script", type=filled, metavar="NAME", help=script)
-    add = parser.add_argument
-    add_shared(parser, "--gym-packages", "--engine")
-    add_shared(parser, "--hyperparams", help="hyperparameters to change, e.g. learning_rate:0.01")
-    add("--kind", choices=[*KINDS], help="the kind of algorithm (default: as its class)")
-    choices = ("discrete", "box")
-    spaces = "kind of {} (default: the first that works)"
-    add("--observations", choices=choices, help=spaces.format("observations: numbers or vectors"))
-    add("--actions", choices=choices, help=spaces.format("actions: one of two, or a number"))
-    seeds = "seeds for a probe that is not ok with the first; the majority decides (default: 3)"
-    add("--seeds", type=whole_number(1, 100), default=3, metavar="N", help=seeds)
-    first = whole_number(0, 2**31)
-    add("--first-seed", type=first, default=0, metavar="SEED", help="the first seed (0)")
-    add("--json", type=Path, metavar="FILE", help="also write the findings to this file")
+    what.add_argument("--algo", help="agent (train.py --list), or a class of yours: module:Class")
+    what.add_argument("--script", metavar="NAME", help="a function that trains: module:function")
     return parser
 
 
 def main() -> int:
     """Audit an algorithm; return the exit code."""
     args = build_parser().parse_args()
-    if args.json is not None and not args.json.absolute().parent.is_dir():
-        raise UserError(f"--json: there is no folder {args.json.parent}")
     from rl_yardstick.commands.terminal import TextConsole, say
     from rl_yardstick.pipeline.files import write_json
 
@@ -82,7 +64,7 @@ def main() -> int:
         from rl_yardstick.diagnosis.audit import Verdict, audit
     say(console, f"audit of {subject.name}")
     findings = []
-    for finding in audit(subject, range(args.first_seed, args.first_seed + args.seeds)):
+    for finding in audit(subject, range(args.seeds)):
         findings.append(finding)
         reason = "" if finding.state in ("fault", "ok") else f": {finding.text}"
         say(console, f"  {finding.probe:<36}{WORDS[finding.state]}{reason}")

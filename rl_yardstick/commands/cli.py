@@ -1,4 +1,7 @@
-"""What the commands' flags have in common: the parser, readers of values, shared flags, names."""
+"""What the commands' flags have in common: the parser, readers of values, shared flags, names.
+
+`main` is the command without a name: ``yardstick --help`` and ``--version``.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,34 @@ import importlib.util
 import os
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, NoReturn
 
 from rl_yardstick.commands import COMMANDS, NAME, SCRIPTS
-from rl_yardstick.pipeline.errors import OTHER_NAMES, UserError, did_you_mean, shown
+from rl_yardstick.pipeline.errors import OTHER_NAMES, UserError, did_you_mean, shown, unknown
 from rl_yardstick.pipeline.files import portable_name
 
 # --- names of the commands ------------------------------------------------------------------------
+
+
+def main() -> int:
+    """Print the help or the version; refuse what is no command."""
+    from importlib.metadata import version
+
+    word = sys.argv[1] if len(sys.argv) > 1 else ""
+    if word == "--version":
+        sys.stdout.write(f"{version('rl-yardstick')}\n")
+    elif word in ("-h", "--help"):
+        lines = "".join(f"  {NAME} {each:<9}{summary}\n" for each, summary in COMMANDS.items())
+        sys.stdout.write(f"usage: {NAME} [-h] [--version] COMMAND ...\n\ncommands:\n{lines}")
+    elif not word:
+        raise UserError(f"which command? {', '.join(COMMANDS)}")
+    else:
+        raise unknown("unknown command", word, COMMANDS)
+    return 0
 
 
 def called_as(command: str) -> str:
@@ -40,18 +61,44 @@ def command_line() -> str:
 
 # --- the parser -----------------------------------------------------------------------------------
 
+# The names of a flag, and argparse's options.
+Flag = tuple[list[str], dict[str, Any]]
+Flags = Mapping[str, Sequence[Flag]]  # by the title of their group
+
+
+def flag(names: str, words: str, reader: Any = None, default: Any = None, **options: Any) -> Flag:
+    """A flag: its names with spaces between them, its help, and the reader of its value."""
+    read = {} if reader is None else {"type": reader, "metavar": "N"}
+    return names.split(), {"help": words, "default": default, **read, **options}
+
+
+def switch(names: str, words: str, **options: Any) -> Flag:
+    """A flag without a value."""
+    return names.split(), {"help": words, "action": "store_true", **options}
+
+
+def several(names: str, words: str, metavar: Any = "KEY:VALUE", **options: Any) -> Flag:
+    """A flag with one value or more; each has its own list, or args.yml would get anchors."""
+    return flag(names, words, **{"nargs": "+", "default": [], "metavar": metavar, **options})
+
 
 class OneLineParser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line that names the nearest flag."""
+    """A parser of groups of flags, by their titles, whose errors are one line."""
 
-    def __init__(self, epilog: str = "", **kwargs: Any) -> None:
+    def __init__(
+        self, description: str, epilog: str, flags: Flags | None = None, **kwargs: Any
+    ) -> None:
         kwargs.setdefault("prog", os.path.basename(sys.argv[0]))  # noqa: PTH119  # a name
         for command in COMMANDS:
             for typed in (f"python {command}.py", f"python -m rl_yardstick {command}"):
                 epilog = epilog.replace(typed, called_as(command))
         # No abbreviations: --seed would be taken for --seeds, which means something else.
-        kind = argparse.RawDescriptionHelpFormatter
-        super().__init__(allow_abbrev=False, formatter_class=kind, epilog=epilog, **kwargs)
+        kwargs |= {"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter}
+        super().__init__(description=description, epilog=epilog, **kwargs)
+        for title, members in (flags or {}).items():
+            group = self.add_argument_group(title) if title else self
+            for names, options in members:
+                group.add_argument(*names, **options)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse's; the words are kept for hints."""
@@ -60,14 +107,14 @@ class OneLineParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise the mistake as `UserError`."""
-        unknown = message.removeprefix("unrecognized arguments: ")
-        if unknown != message:
-            flags = [flag for action in self._actions for flag in action.option_strings]
-            words = unknown.split()
+        surplus = message.removeprefix("unrecognized arguments: ")
+        if surplus != message:
+            flags = [name for action in self._actions for name in action.option_strings]
+            words = surplus.split()
             if words and words[0] in self._typed:  # with a value that was taken for a model
                 words = self._typed[self._typed.index(words[0]) :]
             text = hint(words, flags)
-            message = f"unknown argument {unknown}{': ' if text else ''}{text}"
+            message = f"unknown argument {surplus}{': ' if text else ''}{text}"
         raise UserError(f"{message} (see --help)")
 
 
@@ -80,60 +127,27 @@ _INSTEAD: Mapping[str, str] = {
     **dict.fromkeys(("--study-name", "--optimization-log-path"), _SEARCH),
     "--storage": "tune stores the trials in trials.db, in the folder of the search",
     **dict.fromkeys(("--track", "--wandb-project-name", "--wandb-entity"), _NO_WANDB),
+    **dict.fromkeys(("-yaml", "--yaml-file"), "did you mean '--conf-file'?"),
     "--n-evaluations": "give the steps between evaluations: --eval-freq",
     "--trial-id": "tune writes a file for --conf-file, winner.yml",
     "--trust": "it is not needed: every file is read as data",
 }
-# Our flags, and words that people type for them; a hint names the first flag the command has.
-_TYPED_FOR: Mapping[str, str] = {
-    "--algo": "algorithm agent model agents algorithms",
-    "--algos": "agents algorithms algorithm agent model",
-    "--env": "environment env-id env-name game envs",
-    "--n-timesteps": "timesteps total-timesteps steps num-timesteps max-steps n-steps",
-    "--n-episodes": "episodes num-episodes",
-    "--render": "render-mode mode",
-    "--record": "video gif film record-video save-video",
-    "--device": "gpu cuda cpu",
-    "--verbose": "quiet silent",
-    "--log-folder": "logdir log-dir output out save-dir folder",
-    "--folder": "logdir log-dir output out save-dir log-folder",
-    "--trained-agent": "continue load pretrained",
-    "--jobs": "workers n-jobs num-workers parallel",
-    "--seeds": "seed n-seeds num-seeds",
-    "--conf-file": "config conf yaml yaml-file",
-    "--hyperparams": "params hyperparameters kwargs",
-    "--load-best": "best",
-    "--load-checkpoint": "checkpoint",
-}
 
 
 def hint(words: Sequence[str], flags: Sequence[str]) -> str:
-    """A hint about an unknown flag; empty if no flag or hyperparameter is similar.
-
-    Args:
-        words: the unknown arguments, the flag first.
-        flags: those of the command.
-    """
-    flag, _, value = "".join(words[:1]).partition("=")
-    name = flag.lstrip("-").replace("_", "-").lower()
-    if flag in _INSTEAD:
-        return _INSTEAD[flag]
-    for ours, typed in _TYPED_FOR.items():
-        if name in typed.split() and ours in flags:
-            return f"did you mean {ours!r}?"
-    if setting := _hyperparameter(name.replace("-", "_")):
-        value = value or next((word for word in words[1:2] if not word.startswith("-")), "VALUE")
-        if "--hyperparams" in flags:
-            return f"hyperparameters go behind -params: -params {setting}:{value}"
-        return f"hyperparameters can only be set in train: -params {setting}:{value}"
-    return did_you_mean(flag, flags)
-
-
-def _hyperparameter(name: str) -> str:
-    """The hyperparameter with this name, or with this as another name; empty for none."""
+    """A hint about unknown ``words``, a flag first, by the flags that there are; or no text."""
     from rl_yardstick.pipeline.components import known_names
 
-    return next((one for one in (name, *OTHER_NAMES.get(name, ())) if one in known_names()), "")
+    typed, _, value = "".join(words[:1]).partition("=")
+    name = typed.lstrip("-").replace("-", "_").lower()
+    if typed in _INSTEAD:
+        return _INSTEAD[typed]
+    settings = [one for one in (name, *OTHER_NAMES.get(name, ())) if one in known_names()]
+    if not settings:
+        return did_you_mean(typed, flags)
+    value = value or next((word for word in words[1:2] if not word.startswith("-")), "VALUE")
+    where = "go behind -params" if "--hyperparams" in flags else "can only be set in train"
+    return f"hyperparameters {where}: -params {settings[0]}:{value}"
 
 
 # --- readers of values ----------------------------------------------------------------------------
@@ -144,25 +158,19 @@ LARGEST = 10**12
 def whole_number(
     least: int, most: int = LARGEST, besides: Mapping[int, str] | None = None
 ) -> Callable[[str], int]:
-    """A reader of whole numbers for argparse: ``100000``, ``100_000`` or ``1e5``.
-
-    It accepts numbers from ``least`` to ``most``, and the keys of ``besides`` (with meanings).
-    """
+    """A reader of whole numbers such as ``1e5``; ``besides`` maps further ones to meanings."""
     meanings = besides or {}
 
     def read(text: str) -> int:
-        try:
+        with suppress(InvalidOperation):
             number = Decimal(text)
             if number == number.to_integral_value() and abs(number) <= LARGEST:
                 found = int(number)
                 if least <= found <= most or found in meanings:
                     return found
-        except InvalidOperation:
-            pass
-        bounds = f" of at least {least:,}" if least > -LARGEST else ""
-        bounds += f" and at most {most:,}" if most < LARGEST else ""
         others = "".join(f", or {key} ({meaning})" for key, meaning in meanings.items())
-        raise argparse.ArgumentTypeError(f"must be a whole number{bounds}{others}, not {text!r}")
+        bounds = f"from {least:,} to {most:,}{others}"
+        raise argparse.ArgumentTypeError(f"must be a whole number {bounds}, not {text!r}")
 
     return read
 
@@ -179,17 +187,9 @@ def seconds(text: str) -> float:
     return number
 
 
-def filled(text: str) -> str:
-    """A text that is not empty."""
-    if not text.strip():
-        raise argparse.ArgumentTypeError("must not be empty")
-    return text
-
-
 def folder_name(text: str) -> str:
     """The name of one folder."""
-    is_name = text.strip() not in ("", ".", "..") and set("/\\\0\n").isdisjoint(text)
-    if not is_name or portable_name(text) != text:
+    if portable_name(text) != text:
         raise argparse.ArgumentTypeError(f"must be the name of one folder, not {shown(text)}")
     return text
 
@@ -199,62 +199,76 @@ BUDGET = whole_number(1, besides={-1: "as in the hyperparameters"})  # as in rl_
 INTERVAL = whole_number(-LARGEST)  # below 1 for never, as in rl_zoo3
 LOG_INTERVAL = whole_number(1, besides={-1: "the library's default", -2: "no log"})
 SEED = whole_number(0, 2**32 - 1, besides={-1: "a random one"})  # NumPy's generator takes 32 bits
+FIRST_SEED = whole_number(0, 2**31)
 THREADS = whole_number(1, 1024, besides={-1: "PyTorch's own choice", 0: "likewise"})
 JOBS = whole_number(1, 4096, besides={-1: "all cores", 0: "likewise"})
-VERBOSITY = whole_number(0, 2)
 
 
-def assignments() -> Mapping[str, Any]:
-    """Options of flags that assign values; each with its own list, or args.yml gets anchors."""
-    return {"nargs": "+", "default": [], "metavar": "KEY:VALUE"}
+# --- flags of several commands --------------------------------------------------------------------
 
 
-# Flags that several commands have: their names, argparse options, and help.
-SHARED: Sequence[tuple[str, Mapping[str, Any], str]] = (
-    ("-params --hyperparams", assignments(), ""),
-    ("-conf --conf-file", {"type": Path, "metavar": "YAML"}, "hyperparameters from another file"),
-    ("--env-kwargs", assignments(), "environment arguments"),
-    (
-        "--gym-packages",
-        {"nargs": "+", "type": filled, "default": [], "metavar": "MODULE"},
-        "modules of yours, with environments or agents: names or files",
-    ),
-    (
+_SHARED: Sequence[Flag] = (
+    several("-params --hyperparams", "hyperparameters to change, e.g. learning_rate:0.01"),
+    flag("-conf --conf-file", "hyperparameters from another file", Path, metavar="YAML"),
+    several("--env-kwargs", "environment arguments"),
+    several("--gym-packages", "your modules with environments or agents, or files", "MODULE"),
+    flag(
         "--engine",
-        {"choices": ("auto", "compiled", "library", "interpreted")},
-        (
-            "auto (compiled code where that is possible and the budget is worth it), compiled, "
-            "library (Stable-Baselines3's own loop; the default of dqn, ppo and a2c), or for "
-            "tables interpreted; the default of all others is auto"
-        ),
+        "auto (compiled code where that is possible and the budget is worth it), compiled, "
+        "library (Stable-Baselines3's own loop; the default of dqn, ppo and a2c), or for "
+        "tables interpreted; the default of all others is auto",
+        choices=("auto", "compiled", "library", "interpreted"),
     ),
-    ("--device", {"default": "auto"}, "torch device (default: auto)"),
-    ("--num-threads", {"type": THREADS, "default": 1}, "torch threads (1); -1 leaves it to torch"),
-    ("-n --n-timesteps", {"type": COUNT, "metavar": "N"}, "environment steps of each run"),
-    ("--n-episodes", {"type": COUNT, "metavar": "N"}, "episodes instead of steps"),
-    ("-f --log-folder", {"type": filled}, ""),
-    (
-        "-j --jobs",
-        {"type": JOBS, "default": 0, "metavar": "N"},
-        "runs at once (default: all cores)",
-    ),
-    (
+    flag("--device", "torch device (default: auto)", default="auto"),
+    flag("--num-threads", "torch threads (1); -1 leaves it to torch", THREADS, 1),
+    flag("-n --n-timesteps", "environment steps of each run", COUNT),
+    flag("--n-episodes", "episodes instead of steps", COUNT),
+    flag("-j --jobs", "runs at once (default: all cores)", JOBS, 0),
+    flag(
         "--cluster",
-        {"type": filled, "metavar": "WHERE"},
-        (
-            "do runs on a cluster that shares the folder: a Dask scheduler's address or file, a "
-            "YAML of dask-jobqueue, or local:N"
-        ),
+        "do runs on a cluster that shares the folder: a Dask scheduler's address or file, a "
+        "YAML of dask-jobqueue, or local:N",
+        metavar="WHERE",
     ),
-    ("--run-timeout", {"type": seconds, "metavar": "TIME"}, "end a run after this time, e.g. 10m"),
+    flag("--run-timeout", "end a run after this time, e.g. 10m", seconds, metavar="TIME"),
+    flag("--json", "also write the result to this file", Path, metavar="FILE"),
+    switch(
+        "--diagnose",
+        "compare values, advantages and gradients with the exact ones at each evaluation",
+    ),
 )
 
 
-def add_shared(group: argparse._ActionsContainer, *flags: str, **changes: Any) -> None:
-    """Add shared flags; ``changes`` are argparse options that differ in this command."""
-    for flag in flags:
-        names, options, words = next(each for each in SHARED if flag in each[0].split())
-        group.add_argument(*names.split(), **{"help": words, **options, **changes})
+def shared(*names: str, **changes: Any) -> list[Flag]:
+    """Flags that several commands have; ``changes`` are options that differ in this command."""
+    table = {known[-1]: (known, options) for known, options in _SHARED}
+    return [(table[name][0], {**table[name][1], **changes}) for name in names]
+
+
+def import_typed(args: argparse.Namespace) -> None:
+    """Import the modules of ``--gym-packages`` and of ``--env module:Id-v0``, and drop the latter.
+
+    ``args.env`` is one id, a list of ids, or None.
+    """
+    from rl_yardstick.pipeline.components import import_modules, split_id
+
+    ids = args.env if isinstance(args.env, list) else [args.env or ""]
+    found = [split_id(env_id) for env_id in ids]
+    args.gym_packages = [*args.gym_packages, *(module for module, _ in found if module)]
+    names = [name for _, name in found]
+    args.env = names if isinstance(args.env, list) else names[0]
+    import_modules(args.gym_packages)
+
+
+def check_alone(parser: OneLineParser, beside: Collection[str]) -> None:
+    """Refuse what is typed beside ``--resume``, but for the flags whose ``dest`` is given."""
+    for action in parser._actions:
+        action.default = argparse.SUPPRESS  # only typed flags remain, also typed defaults
+    typed = vars(parser.parse_args())
+    for action in parser._actions:
+        if action.dest in typed and action.dest not in beside:
+            name = next(reversed(action.option_strings), action.dest)
+            raise UserError(f"{name} cannot be given with --resume: the run has its own")
 
 
 # --- checks of values -----------------------------------------------------------------------------
@@ -268,17 +282,13 @@ def check_tensorboard(wanted: object) -> None:
 
 def check_device(device: str) -> None:
     """Raise `UserError` if PyTorch lacks the device; the library would silently use the CPU."""
-    if device in ("auto", "cpu"):
-        return
-    import torch as th
+    if device not in ("auto", "cpu"):
+        import torch as th
 
-    try:
-        th.zeros(1, device=device).item()
-    except (RuntimeError, AssertionError) as error:
-        raise UserError(
-            f"--device: PyTorch has no {device!r} here: 'auto' takes the best one, 'cpu' is "
-            "always there"
-        ) from error
+        try:
+            th.zeros(1, device=device).item()
+        except (RuntimeError, AssertionError) as error:
+            raise UserError(f"--device: PyTorch has no {device!r} here") from error
 
 
 def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dict[str, Any]:
@@ -290,10 +300,6 @@ def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dic
     said = settings.get("engine", word)
     if said != word:
         raise UserError(f"--engine {word} and -params engine:{said} disagree: give one of them")
-    engines = [kind[1:] for kind in arguments_of(algo).get("engine", []) if kind.startswith("=")]
-    if word in engines:
-        return {**settings, "engine": word}
-    if not engines and word in ("auto", "library"):
-        return dict(settings)
-    has = f"the engines {', '.join(engines)}" if engines else "one engine, which auto means"
-    raise UserError(f"--engine {word}: {algo} has {has}")
+    if word in ("auto", "library") and "engine" not in arguments_of(algo):
+        return dict(settings)  # there is one engine
+    return {**settings, "engine": word}

@@ -9,16 +9,15 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import (
-    COUNT,
+    Flags,
     OneLineParser,
-    add_shared,
-    called_as,
-    check_tensorboard,
-    command_line,
-    folder_name,
+    flag,
+    several,
+    shared,
+    switch,
     whole_number,
-    with_engine,
 )
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
 
@@ -36,88 +35,15 @@ if TYPE_CHECKING:
 
 # --- flags ----------------------------------------------------------------------------------------
 
-SEEDS = whole_number(1, 1_000_000)
-
 EPILOG = """\
 examples:
   python compare.py --env FrozenLake-v1 --algos qlearning sarsa dqn ppo --seeds 10
-  python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --engine auto
-  python compare.py studies/warehouse-learning-rate.yml
-  python compare.py studies/warehouse-learning-rate.yml --quick
   python compare.py studies/warehouse-learning-rate.yml --until-decided
   python compare.py --resume logs/studies/warehouse-learning-rate
   python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
 
 The same command again does the missing runs, and no others.
 """
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The flags; those of single runs have the same meaning as in train."""
-    parser = OneLineParser(
-        description="Compare agents on environments over seeds: tables, figures, and a page.",
-        epilog=EPILOG,
-    )
-    add = parser.add_argument
-    add("study", nargs="?", metavar="STUDY.yml", help="a study file, or the name of a shipped one")
-    add("--env", nargs="+", default=[], metavar="ID", help="environments")
-    add("--algos", nargs="+", default=[], metavar="AGENT", help="agents (train --list has them)")
-    add("--seeds", type=SEEDS, metavar="N", help="how many seeds (default: the study's, or 10)")
-    first = "the first of these seeds (default: the study's, or 0)"
-    add("--first-seed", type=whole_number(0, 2**31), metavar="N", help=first)
-    decided = "give agents in undecided pairs more seeds, at looks that are fixed beforehand"
-    add("--until-decided", action="store_true", help=decided)
-    add("--max-seeds", type=SEEDS, metavar="N", help="the most seeds for that (default: 80)")
-    add_shared(parser, "--n-timesteps", "--n-episodes")
-    add_shared(parser, "--hyperparams", help="hyperparameters to change in every agent")
-    add_shared(parser, "--engine")
-    files = "hyperparameters from another file; with several agents, for which: dqn:mine.yml"
-    add("-conf", "--conf-file", nargs="+", default=[], metavar="[AGENT:]YAML", help=files)
-    add_shared(parser, "--env-kwargs")
-    unmodified = "train every agent on the unmodified environment, without the changes that "
-    unmodified += "settings make in training only (train_env_kwargs, train_env_wrapper)"
-    add("--as-it-comes", action="store_true", help=unmodified)
-    add_shared(parser, "--gym-packages")
-    quick = "few seeds and a small budget, for a first look"
-    add("--quick", action="store_true", dest="is_quick", help=quick)
-
-    group = parser.add_argument_group("runs")
-    add_shared(group, "--jobs", "--cluster", "--run-timeout")
-    add = group.add_argument
-    replaced = "do finished runs with other settings again; the old folders are kept"
-    add("--replace", action="store_true", help=replaced)
-    resumed = "do what is left of the study in this folder, as it was asked for"
-    add("--resume", type=Path, metavar="STUDY", help=resumed)
-
-    _add_output_flags(parser.add_argument_group("judgement and output"))
-
-    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
-    add("--logged", type=Path, metavar="LOG.csv", help="judge trained agents on logged pulls")
-    add("--policy", nargs="+", default=[], type=Path, metavar="RUN", help="run folders or zips")
-    named = "the log's own names of columns, e.g. arm=item_id reward=click"
-    add("--columns", nargs="+", default=[], metavar="NAME=COLUMN", help=named)
-    return parser
-
-
-def _add_output_flags(group: argparse._ArgumentGroup) -> None:
-    add = group.add_argument
-    add("--metric", help="the figure that verdicts compare: final, best, area, regret, ...")
-    tied = "difference of the means within which agents are tied"
-    add("--margin", type=_margin, help=tied)
-    add("--episodes-table", type=COUNT, metavar="N", help="average, min, max of every N episodes")
-    filmed = "film one episode after every N episodes"
-    add("--render-every", type=whole_number(0), default=0, metavar="N", help=filmed)
-    add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
-    add_shared(group, "--log-folder", default="logs/studies", help="folder of all studies")
-    add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
-    compared = "compare values, advantages and gradients with the exact ones at each evaluation"
-    add("--diagnose", action="store_true", default=None, help=compared)
-    watched = "train the first run of each agent again, and link pages that play how it learns"
-    add("--watch-learning", action="store_true", dest="learning_pages", help=watched)
-    formats = "formats of the figures: png, svg, pdf (default: png svg)"
-    kinds = ("png", "svg", "pdf")
-    add("--figures", nargs="+", choices=kinds, metavar="FORMAT", help=formats)
-    add("--no-report", action="store_true", help="only tables: no figures and no page")
 
 
 def _margin(text: str) -> float:
@@ -127,36 +53,85 @@ def _margin(text: str) -> float:
     raise argparse.ArgumentTypeError(f"must be a number of at least 0, not {text!r}")
 
 
+SEEDS = whole_number(1, 1_000_000)
+FLAGS: Flags = {
+    "": (
+        flag("study", "a study file, or the name of a shipped one", nargs="?", metavar="STUDY.yml"),
+        several("--env", "environments", "ID"),
+        several("--algos", "agents (train --list has them)", "AGENT"),
+        flag("--seeds", "how many seeds (default: the study's, or 10)", SEEDS),
+        flag(
+            "--first-seed", "the first of these seeds (default: the study's, or 0)", cli.FIRST_SEED
+        ),
+        switch(
+            "--until-decided", "more seeds for agents in undecided pairs, at looks fixed before"
+        ),
+        flag("--max-seeds", "the most seeds for that (default: 80)", SEEDS),
+        *shared("--n-timesteps", "--n-episodes"),
+        *shared("--hyperparams", help="hyperparameters to change in every agent"),
+        *shared("--engine"),
+        several("-conf --conf-file", "hyperparameters from another file", "[AGENT:]YAML"),
+        *shared("--env-kwargs"),
+        switch("--as-it-comes", "without the settings' changes of environments in training"),
+        *shared("--gym-packages"),
+        switch("--quick", "few seeds and a small budget, for a first look", dest="is_quick"),
+    ),
+    "runs": (
+        *shared("--jobs", "--cluster", "--run-timeout"),
+        flag("--resume", "do what is left of the study in this folder", Path, metavar="STUDY"),
+    ),
+    "judgement and output": (
+        flag("--metric", "the figure that verdicts compare: final, best, area, regret, ..."),
+        flag("--margin", "difference of the means within which agents are tied", _margin),
+        flag("--episodes-table", "average, min, max of every N episodes", cli.COUNT),
+        flag("--render-every", "film an episode after every N episodes", whole_number(0), 0),
+        flag("--name", "name of the study's folder", cli.folder_name, metavar="NAME"),
+        flag("-f --log-folder", "folder of all studies", default="logs/studies"),
+        switch("-tb --tensorboard", "write a TensorBoard log of each run"),
+        *shared("--diagnose", default=None),
+        switch("--watch-learning", "pages that play how agents learn", dest="learning_pages"),
+        flag("--figures", "formats (default: png svg)", nargs="+", choices=("png", "svg", "pdf")),
+        switch("--no-report", "only tables: no figures and no page"),
+    ),
+    "off-policy evaluation, instead of a study": (
+        flag("--logged", "judge trained agents on logged pulls", Path, metavar="LOG.csv"),
+        several("--policy", "run folders or zips", "RUN", type=Path),
+        several("--columns", "the log's own names, e.g. arm=item_id reward=click", "NAME=COLUMN"),
+    ),
+}
+
+
+def build_parser() -> OneLineParser:
+    """The flags; those of single runs have the same meaning as in train."""
+    words = "Compare agents on environments over seeds: tables, figures, and a page."
+    return OneLineParser(words, EPILOG, FLAGS)
+
+
 # --- the steps of a study -------------------------------------------------------------------------
 
 
 def main() -> int:
     """Do a study, or judge policies on a log; return the exit code."""
     args = build_parser().parse_args()
-    from rl_yardstick.pipeline.components import check_typed, import_modules, split_id
+    from rl_yardstick.pipeline.components import check_typed
     from rl_yardstick.pipeline.run import Stop
 
     stop = Stop().listen()
-    ids = [split_id(env_id) for env_id in args.env]
-    args.gym_packages = [*args.gym_packages, *(module for module, _ in ids if module)]
-    args.env = [env_id for _, env_id in ids]
-    import_modules(args.gym_packages)
+    cli.import_typed(args)
     if args.logged or args.policy:
-        from rl_yardstick.commands.logged import compare_on_log
-
         return compare_on_log(args)
     from rl_yardstick.commands.terminal import table_console
     from rl_yardstick.experiments.plan import StudyRecord, specs_of
 
     if args.resume is not None:
-        check_alone(args)
+        cli.check_alone(build_parser(), _BESIDE_RESUME)
         root, record = args.resume, StudyRecord.read(args.resume)
         check_typed(record.study.gym_packages, args.gym_packages, str(root))
     else:
         study = study_spec(args)
         root, record = Path(args.log_folder) / study.name, StudyRecord(study, specs_of(study))
     workers = workers_of(args, root, record.study.run_timeout)
-    job = Job(root, command_line(), table_console(), stop, workers, not args.no_report)
+    job = Job(root, cli.command_line(), table_console(), stop, workers, not args.no_report)
     job.console.print(record.study.title, style="bold")
     with held(root), workers:
         if args.until_decided:
@@ -164,7 +139,7 @@ def main() -> int:
 
             looks = plan_of_looks(record.study, root, args.max_seeds)
             record = replace(record, looks=looks)
-        return carry_out(job, record, args.replace)
+        return carry_out(job, record)
 
 
 @dataclass(frozen=True)
@@ -181,97 +156,66 @@ class Job:
 
 @contextmanager
 def held(root: Path) -> Iterator[None]:
-    """Hold a study's folder; it is removed again if nothing comes of it."""
-    from rl_yardstick.pipeline.run import LOCK, Run
+    """Hold a study's folder; a new one is removed again if an error leaves nothing in it."""
+    from rl_yardstick.pipeline.run import Run
 
+    run = Run(root)  # with the lock of a run's folder
+    run.is_new = not root.exists()
     root.mkdir(parents=True, exist_ok=True)
-    with Run(root):  # with the lock of a run's folder
+    with run:
         try:
             yield
         finally:
-            if [path.name for path in root.iterdir()] == [LOCK]:
-                (root / LOCK).unlink()
-                with suppress(OSError):  # of folders above that are not empty
-                    for folder in (root, *list(root.parents)[:2]):
-                        folder.rmdir()
+            run.has_begun = len([*root.iterdir()]) > 1  # more than the lock
 
 
 def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> Workers:
     """The workers that the flags ask for."""
     from rl_yardstick.experiments.pool import Workers, available_cores
 
-    jobs = max(args.jobs, 0)
     if args.cluster is None:
-        return Workers(jobs or available_cores(), timeout)
+        return Workers(max(args.jobs, 0) or available_cores(), timeout)
     try:
         from rl_yardstick.experiments.cluster import ClusterWorkers
 
-        return ClusterWorkers(args.cluster, jobs, root, timeout)
+        return ClusterWorkers(args.cluster, max(args.jobs, 0), root, timeout)
     except ImportError:
         raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'") from None
 
 
-def carry_out(job: Job, record: StudyRecord, replaces: bool = False) -> int:
+def carry_out(job: Job, record: StudyRecord) -> int:
     """Do a study, and judge it; return 0 if all runs are finished, else 1."""
     from rl_yardstick.experiments.plan import plan
 
     study, looks = record.study, record.looks
     planned = plan(study, job.root, specs=record.specs)
-    check_settings_kept(job, planned, replaces)
+    check_settings_kept(job.root, planned)
     record.write(job.root)
-    if engines := _engines(planned):
-        job.console.print(f"engines: {engines}")
     if not looks:
         return conclude(job, do_study(job, study, planned), ())
     results, said = look_by_look(job, record)
     code = conclude(job, results, looks)
-    # The number of runs, compared with a design that gives every agent all seeds.
-    open_ = [p for p in said.pairs if p.word == "undecided"]
-    undecided = "; ".join(f"{p.first} and {p.second} on {p.environment}" for p in open_)
-    left = f"undecided: {undecided}" if undecided else "all is decided"
+    n_undecided = sum(pair.word == "undecided" for pair in said.pairs)
+    left = f"{n_undecided} pairs are undecided" if n_undecided else "all is decided"
     n_runs = sum(sum(by.values()) for by in said.seeds.values())
     design = f"{looks[-1]:,} seeds of each agent would be {looks[-1] * len(record.specs):,}"
     job.console.print(f"{n_runs:,} runs, where {design}; {left}")
     return code
 
 
-def check_settings_kept(job: Job, planned: Sequence[PlannedRun], replaces: bool) -> None:
-    """Refuse to do runs again that finished with other settings, or move them aside."""
+def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
+    """Refuse a study in whose folder runs have finished with other settings."""
     from rl_yardstick.experiments.plan import other_settings
 
     others = other_settings(planned)
-    if not others:
-        return
-    if not replaces:
+    if others:
         pairs = {key: pair for _, settings in others for key, pair in settings.items()}
         named = [f"{key}: {shown(a)} there, {shown(b)} now" for key, (a, b) in pairs.items()]
         words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
         runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
         raise UserError(
-            f"{job.root}: {runs} other settings ({words}): --name NAME makes another study of it, "
-            "--replace does them again and moves the old ones to replaced/"
+            f"{root}: {runs} other settings ({words}): give the study another folder by --name NAME"
         )
-    place = job.root / "replaced" / str(len([*job.root.glob("replaced/*")]) + 1)
-    for run, _ in others:
-        target = place / run.path.relative_to(job.root / "runs")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        run.path.rename(target)
-    runs = "1 run is" if len(others) == 1 else f"{len(others)} runs are"
-    job.console.print(f"{runs} done again: the old folders are in {place} now")
-
-
-def _engines(planned: Sequence[PlannedRun]) -> str:
-    """The engines of the missing runs of networks, in words."""
-    from rl_yardstick.commands.engines import NETWORKS, planned_outlook, study_line
-
-    missing: dict[tuple[str, str], list[PlannedRun]] = {}
-    for run in planned:
-        if run.spec.algo in NETWORKS and not run.is_finished:
-            missing.setdefault(run.labels, []).append(run)
-    if not missing:  # without the libraries
-        return ""
-    found = [(labels[0], planned_outlook(r[0].spec), len(r)) for labels, r in missing.items()]
-    return study_line([(label, each, n) for label, each, n in found if each is not None])
 
 
 def do_study(
@@ -284,14 +228,14 @@ def do_study(
     failures: dict[Path, str] = known.setdefault("failures", {})
     to_do = [run for run in planned if run.path not in failures and not run.is_finished]
     n_done = len(planned) - len(to_do)
-    runs = "1 run" if len(planned) == 1 else f"{len(planned)} runs"
-    there = f"{n_done} of them there already"
-    job.console.print(f"{runs}, {there}; {job.workers.words}, in {job.root}")
+    job.console.print(
+        f"{len(planned)} runs, {n_done} of them there already; {job.workers.words}, in {job.root}"
+    )
     try:
         failures |= do_runs(to_do, job.workers, job.command, job.console, job.stop)
     finally:
         if job.stop.number:
-            again = f"{called_as('compare')} --resume {job.root}"
+            again = f"{cli.called_as('compare')} --resume {job.root}"
             job.console.print(f"stopped; continue with: {again}")
     from rl_yardstick.experiments.results import read_results
 
@@ -320,19 +264,13 @@ def look_by_look(
         is_over = said.is_done or is_enough(said)
         if said.n_looks != n_said:
             n_said = said.n_looks
-            job.console.print(_on_look(said, record.looks))
+            n = sum(pair.word == "undecided" for pair in said.pairs)
+            told = f"{n} of {len(said.pairs)} pairs undecided" if n else "all pairs are decided"
+            where = f"look {n_said} of {len(record.looks)}, at {record.looks[n_said - 1]:,} seeds"
+            job.console.print(f"{where}: {told}")
         if is_over:
             return results, said
         counts |= {(agent, e): n for e, by in said.seeds.items() for agent, n in by.items()}
-
-
-def _on_look(said: Study, looks: Sequence[int]) -> str:
-    """The result of a look: its number of seeds, and of undecided pairs."""
-    text = f"look {said.n_looks} of {len(looks)}, at {looks[max(said.n_looks - 1, 0)]:,} seeds: "
-    n_undecided = sum(pair.word == "undecided" for pair in said.pairs)
-    if not n_undecided:
-        return f"{text}all pairs are decided"
-    return f"{text}{n_undecided} of {len(said.pairs)} pairs undecided"
 
 
 def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
@@ -351,10 +289,7 @@ def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
     for one in results.left_out:
         again = f"remove {one.planned.path} to do it again"
         tell(f"left out: {one.planned.title}: {one.reason}; {again}")
-    n_missing = len(results.planned) - len(results.finished)
-    if n_missing > len(results.failures) + len(results.left_out):
-        tell(f"{n_missing} of {len(results.planned)} runs are missing; the same command continues")
-    return int(n_missing > 0)
+    return int(len(results.finished) < len(results.planned))
 
 
 def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
@@ -370,7 +305,7 @@ def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
 
     print_analysis(console, analysis)
     if failed := worst_failed_run(results):
-        console.print(f"why the worst run failed: {called_as('explain')} {failed}")
+        console.print(f"why the worst run failed: {cli.called_as('explain')} {failed}")
     with console.status("writing the tables"):
         files = [*write_tables(results), *write_verdicts(analysis, job.command)]
     blocks = None
@@ -422,14 +357,6 @@ def _draw(job: Job, analysis: StudyAnalysis, blocks: pd.DataFrame | None) -> lis
 _BESIDE_RESUME = {"resume", "gym_packages", "jobs", "cluster", "no_report", "log_folder"}
 
 
-def check_alone(args: argparse.Namespace) -> None:
-    """Refuse flags of the study itself beside ``--resume``."""
-    usual = vars(build_parser().parse_args([]))
-    others = [name for name, value in vars(args).items() if value != usual[name]]
-    if names := [name for name in others if name not in _BESIDE_RESUME]:
-        raise UserError(f"--resume does a study as it was asked for: leave out {', '.join(names)}")
-
-
 def study_spec(args: argparse.Namespace) -> StudySpec:
     """The study that the arguments select, with their changes."""
     from rl_yardstick.experiments.study import (
@@ -442,14 +369,13 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
 
     if args.max_seeds is not None and not args.until_decided:
         raise UserError("--max-seeds belongs to --until-decided: give both, or --seeds")
-    for flag, is_given in (("quick", args.is_quick), ("replace", args.replace)):
-        if args.until_decided and is_given:
-            raise UserError(f"--until-decided and --{flag} do not go together: give one of them")
+    if args.until_decided and args.is_quick:
+        raise UserError("--until-decided and --quick do not go together: give one of them")
     if args.learning_pages and args.no_report:
         raise UserError("--watch-learning is a section of the page: leave out --no-report")
     if args.metric is not None and args.metric not in METRICS:
         raise unknown("--metric: unknown metric", args.metric, METRICS)
-    check_tensorboard(args.tensorboard)
+    cli.check_tensorboard(args.tensorboard)
     if not args.study:
         study = _study_of_flags(args)
     elif args.env or args.algos:
@@ -475,13 +401,11 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
 
     if not (args.env and args.algos):
         raise UserError("what to compare? give --env and --algos, or a study file")
-    for algo in args.algos:
-        check_agent(algo)
-    for env_id in args.env:
-        check_env_id(env_id)
-    for flag, names in (("--env", args.env), ("--algos", args.algos)):
+    for check, names in ((check_agent, args.algos), (check_env_id, args.env)):
+        for name in names:
+            check(name)
         if len(set(names)) < len(names):
-            raise UserError(f"{flag} names one of them twice")
+            raise UserError("--env or --algos names one of them twice")
     return StudySpec(
         name=file_name(f"{'-'.join(args.env).replace('/', '-')}_{'-'.join(args.algos)}"),
         title="",
@@ -495,19 +419,17 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
     algos = list(dict.fromkeys(agent.algo for agent in study.agents))
     files: dict[str, Path] = {}
     for word in words:
-        algo, colon, name = word.partition(":")
-        if not (colon and algo in algos):
+        algo, _, name = word.partition(":")
+        if algo not in algos:
             if len(algos) > 1:
                 raise UserError(
                     f"--conf-file {word}: whose hyperparameters? a file has those of one "
                     f"agent ({', '.join(algos)}): {algos[0]}:{word}"
                 )
             algo, name = algos[0], word
-        if algo in files:
-            raise UserError(f"--conf-file names two files for {algo}")
         files[algo] = Path(name)
         if not files[algo].is_file():
-            raise UserError(f"--conf-file: there is no file {files[algo]}")
+            raise UserError(f"--conf-file: there is no file {name}")
     return files
 
 
@@ -534,7 +456,7 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     is_free = args.is_quick and args.engine is None and "engine" not in changes
 
     def changed(agent: AgentSpec) -> AgentSpec:
-        own = with_engine(agent.algo, changes, args.engine)
+        own = cli.with_engine(agent.algo, changes, args.engine)
         has_auto = "=auto" in arguments_of(agent.algo).get("engine", ())
         if is_free and has_auto and "engine" not in agent.settings:
             own["engine"] = "auto"
@@ -542,3 +464,29 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
         return replace(agent, settings=layered(agent.settings, own), conf_file=conf_file)
 
     return replace(study, agents=tuple(map(changed, study.agents)))
+
+
+# --- off-policy evaluation ------------------------------------------------------------------------
+
+
+def compare_on_log(args: argparse.Namespace) -> int:
+    """Judge the policies of ``--policy`` on the log of ``--logged``; return the exit code."""
+    from rl_yardstick.commands.terminal import table_console
+
+    if not (args.logged and args.policy):
+        raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
+    if args.study or args.env or args.algos:
+        raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
+    columns = dict(word.partition("=")[::2] for word in args.columns)
+    if wrong := columns.keys() - {"arm", "reward", "propensity"}:
+        raise UserError(f"--columns {wrong.pop()}: name arm, reward or propensity, as arm=item_id")
+    console = table_console()
+    from rl_yardstick.experiments.off_policy import compare_policies, load_policy, read_logged
+    from rl_yardstick.report.terminal import print_comparison
+
+    with console.status("judging the policies"):
+        data = read_logged(args.logged, columns)
+        policies = [load_policy(path, args.gym_packages) for path in dict.fromkeys(args.policy)]
+        compared = compare_policies(data, policies)
+    print_comparison(console, compared)
+    return 0

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rl_yardstick.commands.cli import OneLineParser, add_shared, command_line, filled
-from rl_yardstick.commands.enjoy import add_model_flags, found_model, wanted_model
+from rl_yardstick.commands import cli
+from rl_yardstick.commands.cli import OneLineParser, flag, shared
+from rl_yardstick.commands.enjoy import MODEL_FLAGS, found_model, wanted_model
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -23,26 +24,21 @@ if TYPE_CHECKING:
 EPILOG = """\
 examples:
   python -m rl_yardstick explain --env FrozenLake-v1 --algo qlearning
-  python -m rl_yardstick explain logs/dqn/Taxi-v4_1 --json why.json
   python -m rl_yardstick explain logs/my_study --algo dqn --env Taxi-v4     # its median run
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> OneLineParser:
     """The flags: those of enjoy.py that select an agent, and those of the explanation."""
-    parser = OneLineParser(
-        description="Show where an agent loses return against the optimum, exactly.", epilog=EPILOG
+    tested = "train four seeds with this change, as shipped and as it is; without a change: with "
+    tested += "each of the proposed changes"
+    own = (
+        flag("--test", tested, nargs="*", action="append", metavar="KEY:VALUE"),
+        flag("--map", "draw the cost of each cell, as .png", Path, metavar="FILE"),
+        *shared("--jobs", "--json"),
     )
-    add_model_flags(parser)
-    group = parser.add_argument_group("explaining")
-    add = group.add_argument
-    test = "train four seeds with this change (KEY:VALUE ...), with the shipped settings and as it "
-    test += "is; repeat the flag to try several changes; without a change, try the proposed ones"
-    add("--test", nargs="*", action="append", metavar="KEY:VALUE", help=test)
-    add("--map", type=Path, metavar="FILE", help="draw the cost of each cell, as .png")
-    add("--course", action="store_true", help="also split the gap of each checkpoint of the run")
-    add("--json", type=filled, metavar="FILE", help="also write the explanation to this file")
-    add_shared(group, "--env-kwargs", "--gym-packages", "--jobs")
+    words = "Show where an agent loses return against the optimum, exactly."
+    parser = OneLineParser(words, EPILOG, {"": MODEL_FLAGS, "explaining": own})
     parser.set_defaults(seed=0)
     return parser
 
@@ -51,24 +47,18 @@ def main() -> int:
     """Explain an agent."""
     args = build_parser().parse_args()
     from rl_yardstick.commands.terminal import TextConsole, say
-    from rl_yardstick.report.why import as_words, course_lines, why_lines
-
-    def tell(lines: list[str]) -> None:
-        for line in lines:
-            say(console, line)
+    from rl_yardstick.report.why import as_words, why_lines
 
     console, wanted = TextConsole(), wanted_model(args)
     one = asked(console, wanted)
-    explained = one.explanation()
-    tell(why_lines(explained))
+    from rl_yardstick.diagnosis.explanation import explanation
+
+    explained = explanation(one.found.spec, one.agent, one.evaluator)
+    say(console, "\n".join(why_lines(explained)))
     if explained.proposals and args.test is None:
         likeliest = ", ".join(f"--test {as_words(one)}" for one in explained.proposals[:2])
         say(console, f"to see what helps: {likeliest}, or --test alone")
     data = explained.as_data()
-    if args.course:
-        course = course_of(one, explained)
-        tell(course_lines(course))
-        data["course"] = [{"timesteps": n, **each.as_data()} for n, each in course.items()]
     if args.map is not None:
         draw(one, explained, args.map)
         say(console, f"map: {args.map}")
@@ -77,7 +67,7 @@ def main() -> int:
     if args.json is not None:
         from rl_yardstick.pipeline.files import write_json
 
-        write_json(Path(args.json), data)
+        write_json(args.json, data)
     return 0
 
 
@@ -89,34 +79,22 @@ class Asked:
     evaluator: ExactEvaluator
     agent: BaseAlgorithm
 
-    def explanation(self) -> Explanation:
-        """Where the agent loses return against the optimum."""
-        from rl_yardstick.diagnosis.explanation import explanation
-
-        return explanation(self.found.spec, self.agent, self.evaluator)
-
 
 def asked(console: Console, wanted: Wanted) -> Asked:
     """Find and load an agent, and compute the optimum of its environment."""
     found = found_model(console, median_run(wanted))
     with console.status("computing the optimum"):
         from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
+        from rl_yardstick.pipeline.models import load_agent
+        from rl_yardstick.pipeline.playing import playing_env
 
         spec = found.spec
         evaluator = exact_evaluator(spec)
         if evaluator is None:
             reason = model_refusal(spec) or f"the model of {spec.env_id} is not known"
             raise UserError(f"{reason}, so the gap to the optimum cannot be split")
-        return Asked(found, evaluator, loaded(found))
-
-
-def loaded(found: Model) -> BaseAlgorithm:
-    """The agent, on an environment that is closed again."""
-    from rl_yardstick.pipeline.models import load_agent
-    from rl_yardstick.pipeline.playing import playing_env
-
-    with closing(playing_env(found, None)) as env:
-        return load_agent(found, env)
+        with closing(playing_env(found, None)) as env:
+            return Asked(found, evaluator, load_agent(found, env))
 
 
 def median_run(wanted: Wanted) -> Wanted:
@@ -127,31 +105,16 @@ def median_run(wanted: Wanted) -> Wanted:
 
     rows = pd.read_csv(table, dtype={"agent": str, "environment": str})
     flags = {"agent": ("--algo", wanted.algo), "environment": ("--env", wanted.env_id)}
-    for column, (flag, name) in flags.items():
+    for column, (typed, name) in flags.items():
         names = [str(each) for each in rows[column].unique()]
         chosen = names[0] if name is None and len(names) == 1 else name
         if chosen not in names:
-            raise UserError(f"{wanted.path} is a study: choose one by {flag}: {', '.join(names)}")
+            raise UserError(f"{wanted.path} is a study: choose one by {typed}: {', '.join(names)}")
         rows = rows[rows[column] == chosen]
     rows = rows.sort_values("final", kind="stable")
     place = Path(str(rows["path"].iloc[(len(rows) - 1) // 2]))  # the study may have been moved
     run = wanted.path.joinpath("runs", *place.parts[-2:])
     return replace(wanted, path=run, algo=None, env_id=None)
-
-
-def course_of(one: Asked, last: Explanation) -> dict[int, Explanation]:
-    """The explanation of each checkpoint of the run by its steps, and the last one."""
-    from rl_yardstick.pipeline.run import Run
-
-    saved = {} if one.found.run is None else Run(one.found.run).checkpoints()
-    if not saved:
-        raise UserError("--course: the run has no checkpoints; train it with --save-freq N")
-    course = {}
-    for path in saved.values():
-        then = replace(one, agent=loaded(replace(one.found, path=path)))
-        course[then.agent.num_timesteps] = then.explanation()
-    # A checkpoint has not learnt from its last step.
-    return {**course, one.agent.num_timesteps: last}
 
 
 def draw(one: Asked, explained: Explanation, path: Path) -> None:
@@ -187,10 +150,10 @@ def tried_changes(
     study = intervention_study(spec, changes, name)
     root, specs = Path(args.folder) / "explain" / study.name, specs_of(study)
     planned = plan(study, root, specs=specs)
-    n_workers = max(args.jobs, 0) or available_cores()
-    with held(root), Workers(n_workers, None) as workers:
+    workers = Workers(max(args.jobs, 0) or available_cores())
+    with held(root), workers:
         StudyRecord(study, specs).write(root)
-        job = Job(root, command_line(), console, Stop().listen(), workers)
+        job = Job(root, cli.command_line(), console, Stop().listen(), workers)
         found = tried(do_study(job, study, planned))
     for line in tried_lines(found, explained.optimum):
         say(console, line)

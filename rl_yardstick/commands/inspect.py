@@ -7,17 +7,14 @@ from pathlib import Path
 from rl_yardstick.commands.cli import OneLineParser
 from rl_yardstick.pipeline.errors import UserError, one_line
 
-SUSPICIOUS = 1  # exit code
-
 
 def main() -> int:
     """Print the content of a model file and what is suspicious; return the exit code."""
-    parser = OneLineParser(
-        description="List the content of a model zip and what is suspicious. Nothing in it is run.",
-        epilog="Exit code: 0 if nothing is suspicious, 1 if something is, 2 if it is no model.",
-    )
-    parser.add_argument("model", metavar="ZIP", help="zip of an agent of Stable-Baselines3 or ours")
-    path = Path(parser.parse_args().model)
+    words = "List the content of a model zip and what is suspicious. Nothing in it is run."
+    codes = "Exit code: 0 if nothing is suspicious, 1 if something is, 2 if it is no model."
+    parser = OneLineParser(words, codes)
+    parser.add_argument("model", type=Path, metavar="ZIP", help="zip of an agent")
+    path = parser.parse_args().model
 
     from rl_yardstick.commands.terminal import say, table_console
     from rl_yardstick.safe_files.models import inspect_model
@@ -35,4 +32,4 @@ def main() -> int:
         width = max(map(len, lines), default=0)
         rows = [f"  {name:<{width}}  {text}".rstrip() for name, text in lines.items()]
         say(console, "\n".join([title, *rows]))
-    return SUSPICIOUS if suspicious else 0
+    return int(bool(suspicious))

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rl_yardstick.commands.cli import OneLineParser, add_shared, assignments
+from rl_yardstick.commands import cli
+from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
+from rl_yardstick.commands.train import entry_from_flags
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import gymnasium as gym
 
     from rl_yardstick.mdp.shaping import Effect
@@ -28,33 +28,27 @@ ROUNDING = 1e-9
 EPILOG = """\
 examples:
   python -m rl_yardstick shaping --env Warehouse-v0 --algo ppo
-  python -m rl_yardstick shaping --env Warehouse-v0 --train-env-kwargs shelf_reward:-1 --gamma 0.99
-  python -m rl_yardstick shaping --env FrozenLake-v1 \\
-    --wrapper rl_yardstick.envs.wrappers.TerminationReward reward:-1
+  python -m rl_yardstick shaping --env Warehouse-v0 --train-env-kwargs goal_reward:5
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> OneLineParser:
     """The flags."""
-    parser = OneLineParser(
-        description="Show whether training on other rewards changes the optimal policies, and "
-        "the exact cost. Default: the changes that an agent's settings make in training.",
-        epilog=EPILOG,
-    )
-    add = parser.add_argument
-    add("--env", required=True, help="environment id (see train.py --list)")
-    add("--algo", default="ppo", help="agent whose settings and discount count (default: ppo)")
-    add_shared(parser, "--env-kwargs")
-    kwargs = "arguments of the environment in training, in place of those in the settings"
-    add("--train-env-kwargs", **assignments(), help=kwargs)
-    wrapper = "a wrapper of the environment in training, with arguments (KEY:VALUE ...), in place "
-    wrapper += "of those in the settings; repeat the flag to add a wrapper around it"
+    words = "Show whether training on other rewards changes the optimal policies, and the exact "
+    words += "cost. Default: the changes that an agent's settings make in training."
+    around = "a wrapper of the environment in training, not those in the settings; repeat it to "
+    around += "add a wrapper around this one"
     metavar = ("NAME", "KEY:VALUE")
-    add("--wrapper", nargs="+", action="append", default=[], metavar=metavar, help=wrapper)
-    add("--gamma", type=float, help="discount (default: the agent's)")
-    add_shared(parser, "--hyperparams", help="hyperparameters to change, e.g. gamma:0.9")
-    add_shared(parser, "--conf-file", "--gym-packages")
-    add("--json", type=Path, metavar="FILE", help="also write the result to this file")
+    flags = (
+        flag("--env", "environment id (see train.py --list)", required=True),
+        flag("--algo", "agent whose settings and discount count (default: ppo)", default="ppo"),
+        *shared("--env-kwargs"),
+        several("--train-env-kwargs", "environment arguments in training, not the settings'"),
+        several("--wrapper", around, metavar, action="append"),
+        *shared("--hyperparams", "--conf-file", "--gym-packages", "--json"),
+    )
+    parser = OneLineParser(words, EPILOG, {"": flags})
+    parser.set_defaults(n_timesteps=1, n_episodes=-1, engine=None, eval_env_kwargs=[])
     return parser
 
 
@@ -67,7 +61,7 @@ def main() -> int:
 
     console = TextConsole()
     spec = _spec(args)
-    discount = _discount(args, spec)
+    discount = _discount(spec)
     changes = ", ".join(training_changes(spec)) or "nothing"
     say(console, f"{spec.env_id}; changed in training: {changes}")
     with closing(make_single_env(spec)) as env:
@@ -85,51 +79,37 @@ def main() -> int:
 
 def _spec(args: argparse.Namespace) -> TrainSpec:
     """The settings of the agent, with the changes in training."""
-    from rl_yardstick.pipeline.components import import_modules, split_id
     from rl_yardstick.pipeline.environments import check_env_id, with_files_read
-    from rl_yardstick.pipeline.settings import (
-        check_agent,
-        override,
-        parse_assignments,
-        read_entry,
-        read_spec,
-        training_follows,
-    )
+    from rl_yardstick.pipeline.settings import check_agent, parse_assignments, read_spec
 
-    module, env_id = split_id(args.env)
-    typed = [*args.gym_packages, *filter(None, [module])]
-    import_modules(typed)
+    cli.import_typed(args)
     check_agent(args.algo)
-    check_env_id(env_id)
-    changes = {"n_timesteps": 1, **parse_assignments(args.hyperparams, "-params")}
-    given = parse_assignments(args.env_kwargs, "--env-kwargs")
-    entry = read_entry(args.algo, env_id, args.conf_file, given)
-    if given:
-        changes["env_kwargs"] = {**(entry.get("env_kwargs") or {}), **given}
+    check_env_id(args.env)
+    entry, _ = entry_from_flags(args)
     if args.train_env_kwargs or args.wrapper:
-        changes["train_env_kwargs"] = parse_assignments(args.train_env_kwargs, "--train-env-kwargs")
-        changes["train_env_wrapper"] = [
+        entry["train_env_kwargs"] = parse_assignments(args.train_env_kwargs, "--train-env-kwargs")
+        entry["train_env_wrapper"] = [
             {name: parse_assignments(kwargs, "--wrapper")} for name, *kwargs in args.wrapper
         ]
-    entry, _ = training_follows(override(entry, changes), {**changes, "env_kwargs": given})
-    spec = read_spec(args.algo, env_id, with_files_read(env_id, entry), gym_packages=typed)
+    entry = with_files_read(args.env, entry)
+    spec = read_spec(args.algo, args.env, entry, gym_packages=args.gym_packages)
     for key in ("normalize", "vec_env_wrapper"):
         if getattr(spec, key):
             raise UserError(f"{key}: the rewards that it makes have no model to compare")
     return spec
 
 
-def _discount(args: argparse.Namespace, spec: TrainSpec) -> float:
-    """The discount of the flag, else of the settings, else the default of the agent's class."""
-    found = spec.algorithm.get("gamma") if args.gamma is None else args.gamma
-    if found is None:
-        from rl_yardstick.agents import load_algorithm
-        from rl_yardstick.pipeline.components import constructor_parameters
+def _discount(spec: TrainSpec) -> float:
+    """The discount of the settings, else the default of the agent's class."""
+    from rl_yardstick.agents import load_algorithm
+    from rl_yardstick.pipeline.components import constructor_parameters
 
+    found = spec.algorithm.get("gamma")
+    if found is None:
         parameter = constructor_parameters(load_algorithm(spec.algo)).get("gamma")
         found = None if parameter is None else parameter.default
     if not isinstance(found, int | float) or not 0 <= found <= 1:
-        raise UserError(f"--gamma: a discount from 0 to 1 is needed, not {found}")
+        raise UserError(f"gamma: a discount from 0 to 1 is needed, not {found}")
     return float(found)
 
 
@@ -137,8 +117,7 @@ def _model(spec: TrainSpec, env: gym.Env[Any, Any]) -> TransitionModel:
     """The model of an environment with its wrappers; `UserError` if it is not known."""
     from rl_yardstick.envs.known_models import model_check, transition_model, unknown_wrapper
 
-    model = transition_model(env)
-    if model is not None:
+    if (model := transition_model(env)) is not None:
         return model
     if (wrapper := unknown_wrapper(env)) is not None:
         raise UserError(f"the effect of {wrapper} on the model is not known: nothing to compare")
@@ -196,8 +175,7 @@ class Compared:
         policies = found.policy, found.worst_policy
         split = first_differences(self.model, *policies, self.horizon)
         layout, names = grid_layout(self.env), action_names(self.env)
-        if layout is not None and layout.n_states != self.model.n_states:
-            layout = None
+        layout = layout if layout and layout.n_states == self.model.n_states else None
         named = [names[a] if a < len(names) else f"action {a}" for a in range(self.model.n_actions)]
         return [
             {
@@ -219,8 +197,6 @@ class Compared:
                 "discount": discount,
                 "time_limit": None if discount < 1 else self.horizon,
                 "same": found.is_same,
-                "n_states": int(self.model.reachable.sum()),
-                "n_differing": int(found.differs.sum()),
                 "cost": [found.optimum - each for each in found.returns],
                 "states": self.places(found),
             }

@@ -15,12 +15,9 @@ from rl_yardstick.pipeline.errors import visible
 from rl_yardstick.pipeline.evaluation.yardstick import ROUNDING, rounding
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
     from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 
-UNBOUNDED = 10_000  # columns
 APART = "   "  # between the figures of a result
 
 
@@ -64,18 +61,6 @@ def table_console() -> Console:
     return console if console.is_terminal else TextConsole(width=get_terminal_size().columns)
 
 
-def print_rows(console: Console, table: Table) -> None:
-    """Print a table without borders; in a file or a pipe each row is one line, however long."""
-    if console.is_terminal:
-        console.print(table)
-        return
-    wide = TextConsole(width=UNBOUNDED)
-    with wide.capture() as captured:
-        wide.print(table)
-    for line in captured.get().splitlines():
-        console.print(line.rstrip())
-
-
 def say(console: Console, line: str, style: str | None = None) -> None:
     """Print a line without breaking it, however long."""
     console.print(line, style=style, soft_wrap=True)
@@ -96,7 +81,8 @@ def result_lines(evaluation: Evaluation, *more: str) -> list[str]:
 
 def judged(value: float, yardstick: Yardstick | None, n_episodes: int = 0) -> list[str]:
     """The score of a return and the return; with 0 episodes it is exact."""
-    notes = [f"sampled, {episodes(n_episodes)}"] if n_episodes else []
+    count = f"{n_episodes:,} episode{'s' * (n_episodes > 1)}"
+    notes = [f"sampled, {count}"] if n_episodes else []
     if yardstick is None:
         return [_returned(value, None, notes)]
     if not yardstick.is_proven:
@@ -175,8 +161,3 @@ def percent(share: float) -> str:
     """A share in percent, of which only all is 100 %."""
     most = 100.0 if share > 1 - ROUNDING else 99.9
     return f"{min(round(100 * share, 1), most):g} %"
-
-
-def episodes(n: int) -> str:
-    """A number of episodes in words."""
-    return f"{n:,} episode{'s' if n != 1 else ''}"

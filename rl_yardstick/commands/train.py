@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from contextlib import suppress
+from collections.abc import Callable
+from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import (
-    BUDGET,
-    COUNT,
-    INTERVAL,
-    LOG_INTERVAL,
-    SEED,
-    VERBOSITY,
+    Flags,
     OneLineParser,
-    add_shared,
-    assignments,
-    called_as,
-    check_device,
-    check_tensorboard,
-    command_line,
-    filled,
+    flag,
+    several,
+    shared,
+    switch,
     whole_number,
-    with_engine,
 )
 from rl_yardstick.pipeline.errors import Stopped, UserError
 
@@ -36,111 +30,82 @@ if TYPE_CHECKING:
     from rl_yardstick.pipeline.spec import TrainSpec
     from rl_yardstick.pipeline.training import Training
 
-WATCHED = whole_number(1, besides={0: "those of the first 5,000 steps"})
+RESUMED = "this run, or the newest unfinished one of --algo and --env"
+WATCHED = whole_number(1, besides={0: "the steps in which its policy improves"})
 # Flags that may stand beside --resume: none of the training itself.
-_BESIDE_RESUME = {"resume", "log_folder", "gym_packages", "verbose", "progress", "algo", "env"}
+_BESIDE_RESUME = {"resume", "log_folder", "gym_packages", "verbose", "progress"}
 
 EPILOG = """\
 examples:
   python train.py --env Warehouse-v0 --algo ppo --engine auto
   python train.py --env FrozenLake-v1 --algo qlearning --n-episodes 5000 --seed 0
-  python train.py --env CartPole-v1 --algo dqn -params learning_rate:lin_0.003 buffer_size:50000
-  python train.py --env Warehouse-v0 --algo sarsa --env-kwargs shelf_reward:-1 slip:0.1
   python train.py --resume logs/ppo/Warehouse-v0_3
   python train.py --list
 """
 
+FLAGS: Flags = {
+    "": (
+        flag("--algo", "agent (default: ppo; see --list)", default="ppo"),
+        flag("--env", "environment id (default: CartPole-v1; see --list)", default="CartPole-v1"),
+        switch("--list", "list agents and environments, and which fit which"),
+    ),
+    "budget and settings": (
+        flag("-n --n-timesteps", "environment steps", cli.BUDGET, -1),
+        flag("--n-episodes", "episodes instead of steps", cli.BUDGET, -1),
+        flag("--seed", "seed of everything (default: a random one)", cli.SEED, -1),
+        *shared("--hyperparams", "--engine", "--conf-file", "--env-kwargs"),
+        several("--eval-env-kwargs", "environment arguments for evaluation only"),
+        *shared("--gym-packages"),
+        flag("-i --trained-agent", "zip or run folder to train further", default="", metavar="ZIP"),
+        flag("--vec-env", "kind of VecEnv", default="dummy", choices=["dummy", "subproc"]),
+        *shared("--device", "--num-threads"),
+    ),
+    "evaluation and output": (
+        flag("--eval-freq", "steps between evaluations; -1 for none", cli.INTERVAL),
+        flag("--eval-episodes", "episodes of each (at most 20, or 100 at the end)", cli.COUNT),
+        flag("--n-eval-envs", "environments to evaluate on (10)", cli.COUNT, 10),
+        flag("--save-freq", "steps between checkpoints", cli.INTERVAL, -1),
+        switch("--save-replay-buffer", "save the replay buffer too"),
+        flag("-f --log-folder", "folder of all runs (logs)", default="logs"),
+        switch("-uuid --uuid", "add a unique id to the run folder's name"),
+        flag("-tb --tensorboard-log", "write TensorBoard logs there", default="", metavar="DIR"),
+        flag("--log-interval", "episodes or rollouts between log records", cli.LOG_INTERVAL, -1),
+        flag("--verbose", "0 silent, 1 (default), 2 the library's tables", whole_number(0, 2), 1),
+        switch("-P --progress", "a progress bar even without a terminal"),
+        *shared("--diagnose"),
+        flag("--watch-learning", "write a page (.html) that plays the training", metavar="FILE"),
+        flag("--watch-episodes", "first episodes of a table to play on it", WATCHED, 0),
+    ),
+    "resuming": (
+        flag("--resume", RESUMED, nargs="?", const="", metavar="RUN"),
+        switch("--resume-or-start", "resume the newest run with these settings, or start one"),
+    ),
+}
 
-def build_parser() -> argparse.ArgumentParser:
+
+def build_parser() -> OneLineParser:
     """The flags, with the names and meanings that rl_zoo3 gives them."""
-    parser = OneLineParser(
-        description="Train an agent and leave a run folder with its models, curves and settings.",
-        epilog=EPILOG,
-    )
-    add = parser.add_argument
-    add("--algo", default="ppo", help="agent (default: ppo; see --list)")
-    add("--env", default="CartPole-v1", help="environment id (default: CartPole-v1; see --list)")
-    add("--list", action="store_true", help="list agents and environments, and which fit which")
-
-    group = parser.add_argument_group("budget and settings")
-    add = group.add_argument
-    add("-n", "--n-timesteps", type=BUDGET, default=-1, metavar="N", help="environment steps")
-    add("--n-episodes", type=BUDGET, default=-1, metavar="N", help="episodes instead of steps")
-    add("--seed", type=SEED, default=-1, help="seed of everything (default: a random one)")
-    changed = "hyperparameters to change, e.g. learning_rate:0.01"
-    add_shared(group, "--hyperparams", help=changed)
-    add_shared(group, "--engine", "--conf-file", "--env-kwargs")
-    add("--eval-env-kwargs", **assignments(), help="environment arguments for evaluation only")
-    add_shared(group, "--gym-packages")
-    further = "zip or run folder of an agent to train for -n further steps, in a new run folder"
-    add("-i", "--trained-agent", default="", metavar="ZIP", help=further)
-    add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="kind of VecEnv")
-    add_shared(group, "--device", "--num-threads")
-
-    group = parser.add_argument_group("evaluation and output")
-    add = group.add_argument
-    add("--eval-freq", type=INTERVAL, metavar="N", help="steps between evaluations; -1 for none")
-    adaptive = "of each evaluation (adaptive: at most 20, or 100 for the final one)"
-    add("--eval-episodes", type=COUNT, metavar="N", help=f"episodes {adaptive}")
-    n_envs = "environments to evaluate on (10)"
-    add("--n-eval-envs", type=COUNT, default=10, metavar="N", help=n_envs)
-    add("--save-freq", type=INTERVAL, default=-1, metavar="N", help="steps between checkpoints")
-    add("--save-replay-buffer", action="store_true", help="save the replay buffer too")
-    add_shared(group, "--log-folder", default="logs", help="folder of all runs (logs)")
-    add("-uuid", "--uuid", action="store_true", help="add a unique id to the run folder's name")
-    add("-tb", "--tensorboard-log", default="", metavar="DIR", help="write TensorBoard logs there")
-    records = "episodes (PPO, A2C: rollouts) between log records; -2 for none"
-    add("--log-interval", type=LOG_INTERVAL, default=-1, metavar="N", help=records)
-    levels = "0 silent, 1 progress and summary (default), 2 the library's tables as well"
-    add("--verbose", type=VERBOSITY, default=1, help=levels)
-    add("-P", "--progress", action="store_true", help="a progress bar even without a terminal")
-    compared = "compare values, advantages and gradients with the exact ones at each evaluation"
-    add("--diagnose", action="store_true", help=compared)
-    page = "write a page (.html) that plays the training: each update, or each evaluation"
-    add("--watch-learning", type=filled, metavar="FILE", help=page)
-    watched = "first episodes of a table to play (default: the steps in which its policy improves)"
-    add("--watch-episodes", type=WATCHED, default=0, metavar="N", help=watched)
-
-    add = parser.add_argument_group("resuming").add_argument
-    resumed = "resume this run, or the newest unfinished one of --algo and --env, to the same bits"
-    add("--resume", nargs="?", const="", metavar="RUN", help=resumed)
-    started = "resume the newest run with these settings; start one if there is none, and do "
-    started += "nothing if it is finished: for scripts that a queue starts again"
-    add("--resume-or-start", action="store_true", help=started)
-    return parser
+    words = "Train an agent and leave a run folder with its models, curves and settings."
+    return OneLineParser(words, EPILOG, FLAGS)
 
 
 def main() -> int:
     """Train, resume or list."""
     args = build_parser().parse_args()
-
-    from rl_yardstick.pipeline.components import import_modules, split_id
-    from rl_yardstick.pipeline.run import Run, Stop
-
-    module, args.env = split_id(args.env)
-    args.gym_packages = [*args.gym_packages, *filter(None, [module])]
-    import_modules(args.gym_packages)
+    cli.import_typed(args)
     if args.list:
-        from rl_yardstick.commands.lists import print_lists
-
         print_lists()
         return 0
-
     from rl_yardstick.commands.terminal import TextConsole
+    from rl_yardstick.pipeline.run import Run, Stop
 
     stop = Stop().listen()
     console = TextConsole(quiet=args.verbose < 1, force_terminal=args.progress or None)
     if args.resume is not None:
-        check_alone(args)
-        path = Path(args.resume) if args.resume else newest_unfinished(args)
-        return carry_out(resumed_spec(path, args), Run(path, console, stop), args, resumes=True)
+        return resume(Run(unfinished_run(args), console, stop), args)
     spec = spec_from_flags(args)
-    if args.resume_or_start and (found := run_of(spec, Path(args.log_folder), args.seed < 0)):
-        run = Run(found, console, stop)
-        if run.recorded().get("state") == "finished":
-            console.print(f"{found} is finished already")
-            return 0
-        return carry_out(resumed_spec(found, args), run, args, resumes=True)
+    if args.resume_or_start and (found := newest_run(args, partial(has_spec, spec, args.seed < 0))):
+        return resume(Run(found, console, stop), args)
     from uuid import uuid4
 
     suffix = f"_{uuid4()}" if args.uuid else ""
@@ -150,42 +115,22 @@ def main() -> int:
 
 def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool) -> int:
     """Hold the folder, train, and print the result."""
-    from rl_yardstick.commands.engines import engine_outlook, training_line
-    from rl_yardstick.commands.terminal import say
-
-    console = run.console
-
-    def tell(parts: Training) -> None:
-        outlook = engine_outlook(parts.agent, parts.spec, [parts.callback])
-        if not console.quiet and (line := training_line(outlook, parts.agent, parts.callback)):
-            say(console, f"engine   {line}", style="dim")
-
     with run:
-        print_header(console, spec)
+        print_header(run.console, spec)
         if not resumes:
-            run.begin(spec, {**vars(args), "seed": spec.seed}, command_line())
+            run.begin(spec, {**vars(args), "seed": spec.seed}, cli.command_line())
         try:
-            with console.status("loading the libraries"):
+            with run.console.status("loading the libraries"):
                 from rl_yardstick.pipeline.training import train
-            outcome = train(spec, run, resumes, tell)
+            outcome = train(spec, run, resumes, print_engine)
         except Stopped:
             if run.has_begun:
-                console.print(f"stopped; resume with: {called_as('train')} --resume {run.path}")
+                again = f"{cli.called_as('train')} --resume {run.path}"
+                run.console.print(f"stopped; resume with: {again}")
             raise
-        except UserError as error:
-            raise UserError(f"{error}{what_is_kept(run)}") from error
-        print_outcome(console, spec, run, outcome)
+        if not run.console.quiet:
+            print_outcome(run.console, spec, run, outcome)
     return 0
-
-
-def what_is_kept(run: Run) -> str:
-    """The models in the folder of a failed run, in words."""
-    if not run.has_begun:
-        return ""
-    best, n_checkpoints = run.best_model_path, len(run.checkpoints())
-    kept = [best.name] if best.exists() else []
-    kept += [f"{n_checkpoints:,} checkpoint{'s'[: n_checkpoints > 1]}"] if n_checkpoints else []
-    return f"; {run.path} keeps {' and '.join(kept) or 'no model'}"
 
 
 # --- from flags to a spec -------------------------------------------------------------------------
@@ -205,17 +150,9 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
 
     check_agent(args.algo)
     check_env_id(args.env)
-    check_tensorboard(args.tensorboard_log)
-    check_device(args.device)
+    cli.check_tensorboard(args.tensorboard_log)
+    cli.check_device(args.device)
     entry, origins = entry_from_flags(args)
-    trained_agent = None
-    if args.trained_agent:
-        from rl_yardstick.pipeline.models import model_in, zip_data
-
-        path = Path(args.trained_agent)
-        path = model_in(path) if path.is_dir() else path
-        zip_data(path)
-        trained_agent = str(path.absolute())
     names = ["eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer"]
     names += ["log_interval", "vec_env", "device", "diagnose", "watch_episodes", "gym_packages"]
     spec = read_spec(
@@ -225,10 +162,10 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
         seed=args.seed if args.seed >= 0 else randbelow(2**31),
         final_episodes=args.eval_episodes,
         n_threads=args.num_threads,
-        trained_agent=trained_agent,
+        trained_agent=whole_zip(Path(args.trained_agent)) if args.trained_agent else None,
         tensorboard_log=args.tensorboard_log or None,
         library_log=args.verbose > 1,
-        watch_learning=page_path(args),
+        watch_learning=page_path(args) if args.watch_learning or args.watch_episodes else None,
         map_name=map_name(args.env, entry),
         origins=origins,
         **{name: getattr(args, name) for name in names},
@@ -246,14 +183,14 @@ def entry_from_flags(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
         training_follows,
     )
 
-    asked = parse_assignments(args.hyperparams, "-params")
-    changes = with_engine(args.algo, asked, args.engine)
-    for key, given in (("env_kwargs", args.env_kwargs), ("eval_env_kwargs", args.eval_env_kwargs)):
-        if given:
+    typed = parse_assignments(args.hyperparams, "-params")
+    changes = cli.with_engine(args.algo, typed, args.engine)
+    for key in ("env_kwargs", "eval_env_kwargs"):
+        if given := getattr(args, key):
             named = parse_assignments(given, f"--{key.replace('_', '-')}")
             changes[key] = {**(changes.get(key) or {}), **named}
-    for key, budget in (("n_timesteps", args.n_timesteps), ("n_episodes", args.n_episodes)):
-        if budget > 0:
+    for key in ("n_timesteps", "n_episodes"):
+        if (budget := getattr(args, key)) > 0:
             changes[key] = budget
     try:
         entry = read_entry(args.algo, args.env, args.conf_file, changes.get("env_kwargs"))
@@ -261,19 +198,27 @@ def entry_from_flags(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
         if not changes or args.conf_file:
             raise
         entry = {}
-    typed = dict(changes)
-    for key in ("env_kwargs", "eval_env_kwargs"):
-        if changes.get(key):
-            changes[key] = {**(entry.get(key) or {}), **changes[key]}
-    return training_follows(override(entry, changes), typed)
+    merged = {
+        key: {**(entry.get(key) or {}), **changes[key]}
+        for key in ("env_kwargs", "eval_env_kwargs")
+        if changes.get(key)
+    }
+    return training_follows(override(entry, {**changes, **merged}), changes)
 
 
-def page_path(args: argparse.Namespace) -> str | None:
-    """The path of the page for ``--watch-learning``, checked; None without the flag."""
+def whole_zip(path: Path) -> str:
+    """The absolute path of the zip of ``--trained-agent``, which is whole."""
+    from rl_yardstick.pipeline.models import model_in, zip_data
+
+    path = model_in(path) if path.is_dir() else path
+    zip_data(path)
+    return str(path.absolute())
+
+
+def page_path(args: argparse.Namespace) -> str:
+    """The absolute path of the page of ``--watch-learning``, which can be written."""
     if args.watch_learning is None:
-        if args.watch_episodes:
-            raise UserError("--watch-episodes needs --watch-learning FILE")
-        return None
+        raise UserError("--watch-episodes needs --watch-learning FILE")
     path = Path(args.watch_learning)
     if path.suffix != ".html" or path.is_dir():
         raise UserError(f"--watch-learning writes a .html file, not {path.name!r}")
@@ -285,52 +230,48 @@ def page_path(args: argparse.Namespace) -> str | None:
 # --- resuming -------------------------------------------------------------------------------------
 
 
-def check_alone(args: argparse.Namespace) -> None:
-    """Refuse flags of a training beside ``--resume``: the run has its own."""
-    parser = build_parser()
-    for action in parser._actions:
-        action.default = argparse.SUPPRESS  # only typed flags remain, also typed defaults
-    typed = set(vars(parser.parse_args()))
-    allowed = _BESIDE_RESUME - ({"algo", "env"} if args.resume else set())
-    for action in parser._actions:
-        if action.dest in typed - allowed:
-            flag = action.option_strings[-1]
-            raise UserError(f"{flag} cannot be given with --resume: the run has its own")
-
-
-def resumed_spec(path: Path, args: argparse.Namespace) -> TrainSpec:
-    """The spec of an unfinished run, whose modules were typed."""
+def resume(run: Run, args: argparse.Namespace) -> int:
+    """Resume a run whose modules were typed."""
     from rl_yardstick.pipeline.components import check_typed
-    from rl_yardstick.pipeline.run import resumable
+    from rl_yardstick.pipeline.run import FINISHED, resumable
 
-    if not path.is_dir():
-        raise UserError(f"{path}: there is no such run folder")
-    spec = resumable(path)
-    check_typed(spec.gym_packages, args.gym_packages, str(path))
-    return spec.changed(gym_packages=args.gym_packages)
+    if args.resume_or_start and run.recorded().get("state") == FINISHED:
+        run.console.print(f"{run.path} is finished already")
+        return 0
+    spec = resumable(run.path)
+    check_typed(spec.gym_packages, args.gym_packages, str(run.path))
+    return carry_out(spec.changed(gym_packages=args.gym_packages), run, args, resumes=True)
 
 
-def newest_unfinished(args: argparse.Namespace) -> Path:
-    """The newest run of ``--algo`` and ``--env`` that has not finished."""
+def unfinished_run(args: argparse.Namespace) -> Path:
+    """The run of ``--resume``, or the newest unfinished one of ``--algo`` and ``--env``."""
+    beside = _BESIDE_RESUME if args.resume else _BESIDE_RESUME | {"algo", "env"}
+    cli.check_alone(build_parser(), beside)
+    if not args.resume:
+        over = (None, "finished")
+        found = newest_run(args, lambda run: run.recorded().get("state") not in over)
+        if found is not None:
+            return found
+        raise UserError(f"{args.log_folder} has no unfinished run of {args.algo} on {args.env}")
+    if not Path(args.resume).is_dir():
+        raise UserError(f"{args.resume}: there is no such run folder")
+    return Path(args.resume)
+
+
+def newest_run(args: argparse.Namespace, fits: Callable[[Run], bool]) -> Path | None:
+    """The newest run of ``--algo`` and ``--env`` that fits."""
     from rl_yardstick.pipeline.run import Run, numbered_runs
 
-    name = args.env.replace("/", "-")
-    for _, path in reversed(numbered_runs(Path(args.log_folder) / args.algo, name)):
-        if Run(path).recorded().get("state") not in (None, "finished"):
-            return path
-    raise UserError(f"{args.log_folder} has no unfinished run of {args.algo} on {name}")
+    runs = numbered_runs(Path(args.log_folder) / args.algo, args.env.replace("/", "-"))
+    return next((path for _, path in reversed(runs) if fits(Run(path))), None)
 
 
-def run_of(spec: TrainSpec, log_folder: Path, any_seed: bool) -> Path | None:
-    """The newest run with exactly these settings."""
-    from rl_yardstick.pipeline.run import Run, numbered_runs
-
-    for _, path in reversed(numbered_runs(log_folder / spec.algo, spec.env_name)):
-        with suppress(UserError):
-            found = Run(path).spec()
-            if found == (spec.changed(seed=found.seed) if any_seed else spec):
-                return path
-    return None
+def has_spec(spec: TrainSpec, any_seed: bool, run: Run) -> bool:
+    """Whether a run has exactly these settings."""
+    with suppress(UserError):
+        found = run.spec()
+        return found == (spec.changed(seed=found.seed) if any_seed else spec)
+    return False
 
 
 # --- output ---------------------------------------------------------------------------------------
@@ -343,59 +284,41 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     unit = "steps" if spec.n_timesteps else "episodes"
     budget = spec.n_timesteps or spec.n_episodes or 0
     say(console, f"{spec.algo} on {spec.place}, seed {spec.seed}, {budget:,} {unit}", "bold")
-    plain, explained = [], []
+    plain, explained = list[str](), list[str]()
     for key, value in spec.hyperparams.items():
         if key == "policy" and not str(value).startswith(("Mlp", "Cnn", "MultiInput")):
             continue  # our tables and bandits have one each
-        text = str(value)  # a whole map would fill the screen
-        text = f"{key}={text if len(text) <= 200 else f'{text[:200]}...'}"
-        where = "in training only" if key in ("train_env_kwargs", "train_env_wrapper") else ""
-        notes = "; ".join(filter(None, (where, schedule_in_words(value), spec.origins.get(key))))
-        if notes:
-            explained.append(f"{text} ({notes})")
-        else:
-            plain.append(text)
+        note = spec.origins.get(key)
+        text = f"{key}={str(value)[:200]}"  # a whole map would fill the screen
+        (explained if note else plain).append(f"{text} ({note})" if note else text)
     for line in ["  ".join(plain), *explained] if plain else explained:
         console.print(line, style="dim")
 
 
-def schedule_in_words(value: object) -> str:
-    """A schedule such as ``exp_0.3_0.05`` in words; empty for any other value."""
-    if not (isinstance(value, str) and value.startswith(("lin_", "exp_"))):
-        return ""
-    kind, *numbers = value.split("_")
-    try:
-        start, end = [*map(float, numbers), 0.0][:2]
-    except ValueError:  # the agent's constructor tells
-        return ""
-    how = "linearly" if kind == "lin" else "exponentially"
-    return f"{'falls' if end < start else 'rises'} {how} from {start:g} to {end:g}"
+def print_engine(parts: Training) -> None:
+    """Print on which engine networks will train, and whether compiled code could do it."""
+    agent, steps, callback = parts.agent, parts.spec.total_timesteps, [parts.callback]
+    if hasattr(agent, "engine_plan"):
+        plan, auto = (agent.engine_plan(steps, callback, engine) for engine in (None, "auto"))
+        other = f"; --engine auto: {auto}" if auto.is_compiled and not plan.is_compiled else ""
+        parts.run.console.print(f"engine   {plan}{other}", style="dim", soft_wrap=True)
 
 
 def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Training) -> None:
     """Print what was done, below it the result, and the commands to type next."""
-    if console.quiet:
-        return
-    from rich.table import Table
+    from rl_yardstick.commands.terminal import result_lines, say
 
-    from rl_yardstick.commands.terminal import print_rows, result_lines, say
-
-    table = Table.grid(padding=(0, 2))
-    for row in rows_of(run, outcome):
-        table.add_row(*row)
-    print_rows(console, table)
+    for label, text in rows_of(run, outcome):
+        say(console, f"{label:<9}{text}")
     results = [] if outcome.pulled is None else [describe_pulls(outcome.pulled)]
     results += [] if outcome.final is None else result_lines(outcome.final)
-    for line in [""] * bool(results) + results:
-        say(console, line)
+    say(console, "\n".join(["", *results]) if results else "")
     if outcome.advice is not None:
         console.print(f"instead  {outcome.advice.instead}")
         if outcome.advice.try_first:
             console.print(f"try      {outcome.advice.try_first}")
         say(console, "more     docs/not-learning.md")
-    say(console, "")
-    for label, command in next_commands(spec, run, outcome):
-        say(console, f"{label:<9}{command}")  # however long, so that it can be copied
+    say(console, "\n".join(["", *next_commands(run, spec.gym_packages, outcome)]))
     if outcome.watch is not None and spec.watch_learning is not None:
         from rl_yardstick.report.page.learning import write_learning_page
 
@@ -409,24 +332,23 @@ def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
     from rl_yardstick.commands.terminal import APART, describe_others, judged
 
     taken, final = outcome.progress.taken.cpu_seconds, outcome.final
-    n_steps = outcome.agent.num_timesteps
-    speed = n_steps / max(taken, 1e-9)
-    text = f"{n_steps:,} steps in {taken:.1f} s of processor time ({speed:,.0f} steps/s)"
+    n_steps, evaluation = outcome.agent.num_timesteps, outcome.evaluation
+    speed = f"{n_steps / max(taken, 1e-9):,.0f} steps/s"
+    text = f"{n_steps:,} steps in {taken:.1f} s of processor time ({speed})"
     rows = [("trained", text)]
     if outcome.engine:
         rows.append(("engine", outcome.engine))
     if final is not None and final.others is not None:
         rows += [("beside", line) for line in describe_others(final.others)]
-    if outcome.evaluation.best is not None:
+    if evaluation.best is not None:
         yardstick = None if final is None else final.yardstick
-        best = judged(outcome.evaluation.best, yardstick, outcome.evaluation.best_episodes)
-        rows.append(("best", APART.join([*best, f"at step {outcome.evaluation.best_timesteps:,}"])))
+        best = judged(evaluation.best, yardstick, evaluation.best_episodes)
+        rows.append(("best", APART.join([*best, f"at step {evaluation.best_timesteps:,}"])))
     if final is not None:
-        tests = f"{outcome.evaluation.taken.cpu_seconds:.1f} s of processor time"
         share = outcome.evaluation_steps / max(n_steps, 1)
         played = f"{outcome.evaluation_steps:,} steps beside training ({share:.0%} of it)"
         how = played if outcome.evaluation_steps else "exact, no episodes sampled"
-        rows.append(("tests", f"{how}; {tests}"))
+        rows.append(("tests", f"{how}; {evaluation.taken.cpu_seconds:.1f} s of processor time"))
     return [*rows, ("files", str(run.path))]
 
 
@@ -441,48 +363,55 @@ def describe_pulls(pulls: PullSummary) -> str:
         return f"regret {pulls.regret:,.2f} over {pulls.n_pulls:,} pulls{APART}{best}"
     if pulls.reward is None:
         return f"regret not known: none of {pulls.n_pulls:,} pulls is in the log"
-    return (
-        f"regret not known{APART}reward {pulls.reward:.4f} a pull over the {pulls.n_matched:,} "
-        f"of {pulls.n_pulls:,} that are in the log"
-    )
+    known = f"{pulls.n_matched:,} of {pulls.n_pulls:,} that are in the log"
+    return f"regret not known{APART}reward {pulls.reward:.4f} a pull over the {known}"
 
 
-def next_commands(spec: TrainSpec, run: Run, outcome: Training) -> list[tuple[str, str]]:
-    """Labels and commands, for the working directory of the training."""
-    from rl_yardstick.pipeline.run import numbered_runs
-    from rl_yardstick.pipeline.settings import entry_names
-
-    newest = numbered_runs(run.path.parent, spec.env_name)[-1][1] == run.path
-    chosen = ["--algo", spec.algo, "--env", spec.env_id] if newest else [str(run.path)]
-    log_folder = run.path.parents[1]
-    chosen += ["-f", str(log_folder)] if newest and str(log_folder) != "logs" else []
-    compared = ["--env", spec.env_id, "--algos", spec.algo, *filter(None, [other_agent(spec)])]
-    words = [f"{key}:{value}" for key, value in spec.env_kwargs.items()]
-    compared += ["--env-kwargs", *words] if words else []
-    if not entry_names(spec.algo):  # no shipped settings say how long to train
-        budget = ["-n", spec.n_timesteps] if spec.n_timesteps else ["--n-episodes", spec.n_episodes]
-        compared += map(str, budget)
-    compared += ["--seeds", "10"]
-    compared += ["--engine", "auto"] if spec.algorithm.get("engine") == "auto" else []
-    found = [("watch", "enjoy", chosen), ("explain", "explain", chosen)]
-    found = [*found[: 1 + outcome.can_be_explained], ("compare", "compare", compared)]
-    more = ["--gym-packages", *spec.gym_packages] if spec.gym_packages else []
-    return [(label, f"{called_as(name)} {shlex.join([*w, *more])}") for label, name, w in found]
+def next_commands(run: Run, gym_packages: list[str], outcome: Training) -> list[str]:
+    """Commands to type next, in the working directory of the training."""
+    more = ["--gym-packages", *gym_packages] if gym_packages else []
+    labels = ("watch    ", "enjoy"), ("explain  ", "explain")
+    return [
+        f"{label}{cli.called_as(command)} {shlex.join([str(run.path), *more])}"
+        for label, command in labels[: 1 + outcome.can_be_explained]
+    ]
 
 
-def other_agent(spec: TrainSpec) -> str | None:
-    """The first other agent that fits the environment, if possible one with settings for it."""
-    from contextlib import closing
+# --- the lists of agents and environments ---------------------------------------------------------
+
+
+def print_lists() -> None:
+    """Print the agents, the environments with settings for some agent."""
+    import gymnasium as gym
+    from rich.table import Column, Table
 
     from rl_yardstick.agents import ALGORITHMS, fitting_algorithms
     from rl_yardstick.agents.registry import is_bandit
-    from rl_yardstick.pipeline.environments import make_single_env
+    from rl_yardstick.commands.terminal import table_console
+    from rl_yardstick.envs.wrappers import has_masks
+    from rl_yardstick.pipeline.environments import make_env
     from rl_yardstick.pipeline.settings import entry_names
 
-    with closing(make_single_env(spec)) as env:
-        for_bandits = is_bandit(env)
-        fitting = fitting_algorithms(env.observation_space, env.action_space, for_bandits)
-    others = [name for name in fitting if name != spec.algo and ALGORITHMS[name].is_installed]
-    others = [name for name in others if ALGORITHMS[name].for_bandits is for_bandits]
-    shipped = (name for name in others if spec.env_id in entry_names(name))
-    return next(shipped, others[0] if others else None)
+    agents: list[tuple[str, str]] = [("agent (--algo)", "what it is")]
+    for name, entry in ALGORITHMS.items():
+        missing = "" if entry.is_installed else f"  needs: {entry.install_command}"
+        agents.append((name, entry.summary + missing))
+    told = "agents with hyperparameters for it; also: those that take the default ones"
+    places: list[tuple[str, str]] = [("environment (--env)", told)]
+    tuned = {name: set(entry_names(name)) for name in ALGORITHMS}
+    for env_id in sorted(set().union(*tuned.values()) & set(gym.registry)):
+        with closing(make_env(env_id, {})) as env:
+            spaces = env.observation_space, env.action_space
+            fitting = fitting_algorithms(*spaces, is_bandit(env), has_masks(env))
+        with_entry = [name for name in ALGORITHMS if env_id in tuned[name]]
+        others = [name for name in fitting if name not in with_entry]
+        also = "\nalso: " + " ".join(others) if others else ""
+        places.append((env_id, " ".join(with_entry) + also))
+    console = table_console()
+    for (first, second), *rows in (agents, places):
+        table = Table(Column(first, no_wrap=True), second, box=None, padding=(0, 2, 0, 0))
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+        console.print()
+    console.print("Any environment of Gymnasium works where the spaces fit; see --gym-packages.")

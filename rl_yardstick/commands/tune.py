@@ -8,34 +8,23 @@ import math
 import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from rl_yardstick.commands import cli, compare
 from rl_yardstick.commands.cli import (
-    COUNT,
+    Flags,
     OneLineParser,
-    add_shared,
-    called_as,
-    command_line,
-    filled,
-    folder_name,
+    flag,
     seconds,
+    shared,
+    switch,
     whole_number,
-    with_engine,
 )
-from rl_yardstick.commands.compare import (
-    Job,
-    conclude,
-    do_study,
-    held,
-    look_by_look,
-    typed_settings,
-    workers_of,
-)
+from rl_yardstick.commands.compare import Job, held
 from rl_yardstick.commands.terminal import say, table_console
 from rl_yardstick.pipeline.errors import Stopped, UserError
 from rl_yardstick.tuning.tuning_spec import (
@@ -56,91 +45,66 @@ if TYPE_CHECKING:
 
 # --- flags ----------------------------------------------------------------------------------------
 
-SEEDS: Mapping[str, Any] = {"type": whole_number(1, 1000), "metavar": "N"}
-FIRST_SEED: Mapping[str, Any] = {"type": whole_number(0, 2**31), "metavar": "N"}
-
 EPILOG = """\
 examples:
   python tune.py --env Warehouse-v0 --algo ppo --trials 100
   python tune.py --env FrozenLake8x8-v1 --algo ppo --engine auto -j 4
-  python tune.py --env CartPole-v1 --algo dqn --seeds-per-trial 10 --objective lower
 
 The same command again continues the search.
 """
 
+SEEDS, TRIALS, STARTUP = (whole_number(*ends) for ends in ((1, 1000), (1, 10**5), (0, 10**5)))
+FOLDER = "-f --log-folder --optimization-log-path"  # as in rl_zoo3
+FLAGS: Flags = {
+    "": (
+        flag("--algo", "train --list has them", required=True, metavar="AGENT"),
+        flag("--env", "environment", required=True, metavar="ID"),
+    ),
+    "search": (
+        flag("--n-trials --trials --max-total-trials", "settings to try (100)", TRIALS, 100),
+        flag("--seeds-per-trial", "seeds of each trial (5)", SEEDS, 5),
+        flag("--first-seed", "the first of these seeds (0)", cli.FIRST_SEED, 0),
+        flag("--objective", "value of a trial by its runs", default="mean", choices=OBJECTIVES),
+        flag("--metric", "figure of a run (default: score, return or regret)", choices=FIGURES),
+        flag("--threshold", "the return that counts as solved", float, metavar="RETURN"),
+        flag("--sampler", "what suggests settings (tpe)", default="tpe", choices=SAMPLERS),
+        flag("--pruner", "whether hopeless trials end early", default="auto", choices=PRUNERS),
+        flag("--n-startup-trials", "random trials before the sampler learns (10)", STARTUP, 10),
+        flag("--search-space", "the values to choose from", Path, metavar="YAML"),
+        flag("--seed", "seed of the search (0)", whole_number(0, 2**32 - 1), 0),
+        flag("--timeout", "begin no more runs after this time", seconds, math.inf, metavar="TIME"),
+    ),
+    "re-test": (
+        flag("--retest", "settings to run again on other seeds (3)", whole_number(0, 100), 3),
+        flag("--retest-seeds", "how many other seeds (20)", SEEDS, 20),
+        flag("--first-retest-seed", "the first of these (1000)", cli.FIRST_SEED, 1000),
+        switch("--until-decided", "add seeds, at looks fixed before, until the best is decided"),
+        flag("--max-retest-seeds", "the most other seeds for that (80)", SEEDS),
+    ),
+    "runs": (
+        *shared("--n-timesteps", "--n-episodes"),
+        *shared("--hyperparams", help="hyperparameters of every trial, which are not searched"),
+        *shared("--engine"),
+        *shared("--conf-file", help="start from another file's entry"),
+        *shared("--env-kwargs", "--gym-packages"),
+        flag("--eval-freq", "steps between two evaluations", cli.COUNT),
+        flag("--eval-episodes", "episodes of a sampled evaluation (20)", cli.COUNT, 20),
+        *shared("--jobs", "--cluster", "--run-timeout"),
+    ),
+    "output": (
+        flag("--name --study-name", "name of the search's folder", cli.folder_name, metavar="NAME"),
+        flag(FOLDER, "folder of all searches (logs/tuning)", default="logs/tuning"),
+        switch("--no-report --no-optim-plots", "only tables: no figures and no page"),
+        switch("-optimize --optimize-hyperparameters", argparse.SUPPRESS),  # rl_zoo3's
+    ),
+}
 
-def build_parser() -> argparse.ArgumentParser:
+
+def build_parser() -> OneLineParser:
     """The flags; those of runs are as in train and compare, many others as in rl_zoo3."""
-    parser = OneLineParser(
-        description="Search for an agent's hyperparameters: judge each setting over several seeds, "
-        "run the best again on other seeds, and save a setting that is better there.",
-        epilog=EPILOG,
-    )
-    parser.add_argument("--algo", required=True, metavar="AGENT", help="train --list has them")
-    parser.add_argument("--env", required=True, metavar="ID", help="environment")
-    _add_search(parser.add_argument_group("search").add_argument)
-    _add_retest(parser.add_argument_group("re-test").add_argument)
-
-    group = parser.add_argument_group("runs")
-    add_shared(group, "--n-timesteps", "--n-episodes")
-    add_shared(
-        group, "--hyperparams", help="hyperparameters of every trial, which are not searched"
-    )
-    add_shared(group, "--engine")
-    add_shared(group, "--conf-file", help="start from another file's entry")
-    add_shared(group, "--env-kwargs", "--gym-packages")
-    add = group.add_argument
-    add("--eval-freq", type=COUNT, metavar="N", help="steps between two evaluations")
-    episodes = "episodes of a sampled evaluation (20)"
-    add("--eval-episodes", type=COUNT, default=20, metavar="N", help=episodes)
-    add_shared(group, "--jobs", "--cluster", "--run-timeout")
-
-    add = parser.add_argument_group("output").add_argument
-    name = "name of the search and its folder (default: ENV_AGENT)"
-    add("--name", "--study-name", type=folder_name, help=name)
-    names = ("-f", "--log-folder", "--optimization-log-path")
-    add(*names, type=filled, default="logs/tuning", help="folder of all searches (logs/tuning)")
-    tables = "only tables: no figures and no page"
-    add("--no-report", "--no-optim-plots", action="store_true", help=tables)
-    # Users of rl_zoo3 type it; this command always does what it asks for.
-    add("-optimize", "--optimize-hyperparameters", action="store_true", help=argparse.SUPPRESS)
-    return parser
-
-
-def _add_search(add: Callable[..., Any]) -> None:
-    trials: dict[str, Any] = {"dest": "n_trials", "type": whole_number(1, 100_000), "metavar": "N"}
-    names = ("--trials", "--n-trials", "--max-total-trials")
-    add(*names, **trials, default=100, help="settings to try (100)")
-    add("--seeds-per-trial", **SEEDS, default=5, help="seeds of each trial (5)")
-    add("--first-seed", **FIRST_SEED, default=0, help="the first of these seeds (0)")
-    statistic = "the value of a trial by its runs: mean (default), interquartile mean, or lower "
-    statistic += "quartile"
-    add("--objective", choices=OBJECTIVES, default="mean", help=statistic)
-    figure = "which figure of a run counts (default: score, the final policy's return between the "
-    figure += "best random or constant policy, 0, and the optimum, 1; the return if no optimum is "
-    figure += "known; on bandits regret); steps: those until the threshold"
-    add("--metric", choices=FIGURES, help=figure)
-    add("--threshold", type=float, metavar="RETURN", help="the return that counts as solved")
-    add("--sampler", choices=SAMPLERS, default="tpe", help="what suggests settings (tpe)")
-    pruned = "whether hopeless trials end early (auto: they do)"
-    add("--pruner", choices=PRUNERS, default="auto", help=pruned)
-    drawn, count = "random trials before the sampler learns (10)", whole_number(0, 100_000)
-    add("--n-startup-trials", type=count, default=10, metavar="N", help=drawn)
-    space = "the values to choose from (default: hyperparams/search_spaces/AGENT.yml)"
-    add("--search-space", type=Path, metavar="YAML", help=space)
-    add("--seed", type=whole_number(0, 2**32 - 1), default=0, help="seed of the search (0)")
-    timeout = "begin no more runs after this time, e.g. 50m; then comes the re-test"
-    add("--timeout", type=seconds, default=math.inf, metavar="TIME", help=timeout)
-
-
-def _add_retest(add: Callable[..., Any]) -> None:
-    again = "run the best K settings and the shipped ones again on other seeds (3; 0 for none)"
-    add("--retest", type=whole_number(0, 100), default=3, metavar="K", help=again)
-    add("--retest-seeds", **SEEDS, default=20, help="how many other seeds (20)")
-    add("--first-retest-seed", **FIRST_SEED, default=1000, help="the first of these (1000)")
-    decided = "add seeds, at looks fixed beforehand, until the best setting is decided to be better"
-    add("--until-decided", action="store_true", help=decided)
-    add("--max-retest-seeds", **SEEDS, help="the most other seeds for that (80)")
+    words = "Search for an agent's hyperparameters: judge each setting over several seeds, run "
+    words += "the best again on other seeds, and save a setting that is better there."
+    return OneLineParser(words, EPILOG, FLAGS)
 
 
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:
@@ -159,13 +123,8 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
         raise UserError("tuning needs: pip install 'rl-yardstick[tune]'")
     check_agent(args.algo)
     check_env_id(args.env)
-    for flag, path in (("--conf-file", args.conf_file), ("--search-space", args.search_space)):
-        if path is not None and not path.is_file():
-            raise UserError(f"{flag}: there is no file {path}")
-    if args.n_timesteps is not None and args.n_episodes is not None:
-        raise UserError("how long to train? give -n or --n-episodes, not both")
     # The settings that the command line fixes.
-    settings = with_engine(args.algo, typed_settings(args), args.engine)
+    settings = cli.with_engine(args.algo, compare.typed_settings(args), args.engine)
     study = StudySpec(
         name=args.name or file_name(f"{args.env.replace('/', '-')}_{args.algo}"),
         title="",
@@ -194,17 +153,14 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
 def main() -> int:
     """Parse the arguments, search and re-test; return the exit code."""
     args = build_parser().parse_args()
-    from rl_yardstick.pipeline.components import import_modules, split_id
     from rl_yardstick.pipeline.run import Stop
 
     stop, deadline = Stop().listen(), time.monotonic() + args.timeout
-    module, args.env = split_id(args.env)
-    args.gym_packages = [*args.gym_packages, *filter(None, [module])]
-    import_modules(args.gym_packages)
+    cli.import_typed(args)
     tuning = tuning_spec(args)
     root = Path(args.log_folder) / tuning.study.name
-    workers = workers_of(args, root, tuning.study.run_timeout)
-    job = Job(root, command_line(), table_console(), stop, workers, not args.no_report)
+    workers = compare.workers_of(args, root, tuning.study.run_timeout)
+    job = Job(root, cli.command_line(), table_console(), stop, workers, not args.no_report)
     job.console.print(tuning.study.title, style="bold")
     with job.console.status("loading the libraries"):
         from rl_yardstick.tuning.searching import open_search, storage_errors
@@ -261,11 +217,7 @@ def do_retest(job: Job, search: Search) -> int:
             print_winner(job.console, search, outcome.winner.number, path)
         return code
     if search.tuning.retest:
-        which = "no settings but the shipped ones" if ranked else "no settings"
-        why = f"{which} were judged to the end"
-        if any(each.number for each in ranked):
-            why = "the best settings are clearly below the shipped settings in the search"
-        say(job.console, f"{why}: no re-test")
+        say(job.console, "no re-test: no other setting came close to the shipped one")
     write_down(job, search, None)
     return 0 if ranked or not search.is_done else 1
 
@@ -279,17 +231,16 @@ def retested(
     from rl_yardstick.tuning.retesting import FOLDER, concluded, is_settled, retest_study
 
     tuning, again = search.tuning, replace(job, root=job.root / FOLDER)
-    study = retest_study(tuning, job.root, chosen)
-    is_growing, most = tuning.until_decided, tuning.max_retest_seeds
-    looks = plan_of_looks(study, again.root, most) if is_growing else ()
+    study, most = retest_study(tuning, job.root, chosen), tuning.max_retest_seeds
+    looks = plan_of_looks(study, again.root, most) if tuning.until_decided else ()
     record = StudyRecord(study, specs_of(study), looks)
     with held(again.root):
         record.write(again.root)
         if looks:
-            results, _ = look_by_look(again, record, is_settled)
+            results, _ = compare.look_by_look(again, record, is_settled)
         else:
-            results = do_study(again, study, plan(study, again.root, specs=record.specs))
-        code = conclude(again, results, looks)
+            results = compare.do_study(again, study, plan(study, again.root, specs=record.specs))
+        code = compare.conclude(again, results, looks)
         with job.console.status("judging the winner"):
             return code, concluded(tuning, ranked, chosen, analyse(results, looks))
 
@@ -314,56 +265,36 @@ def write_down(job: Job, search: Search, outcome: Outcome | None) -> None:
 
 
 def print_opened(job: Job, search: Search) -> None:
-    """Print the number of trials, seeds and free settings, and the engines."""
-    from rl_yardstick.commands.engines import NETWORKS, planned_outlook, search_line
+    """Print the number of trials, seeds and free settings."""
     from rl_yardstick.tuning.retesting import unproven_mark
-    from rl_yardstick.tuning.suggesting import planned_runs, shipped_run
 
-    tuning, suggestions, algo = search.tuning, search.suggestions, search.tuning.agent.algo
+    suggestions = search.suggestions
     n_there = sum(trial.state.is_finished() for trial in search.trials)
-    there = f"{search.n_trials} trials of up to {len(tuning.seeds)} seeds, {n_there} of them there"
-    free = f"{suggestions.n_free} settings to choose; {job.workers.words}, in {job.root}"
-    lines = [f"{there} already; {free}"]
-    if mark := unproven_mark(tuning):
-        lines.append(f"scores are{mark}")
-    wider = "the search space is widened to hold the shipped value"
-    lines += [f"{name}: {wider}" for name in suggestions.space.widened]
-    if algo in NETWORKS:
-        searched = planned_runs(tuning, job.root, suggestions.shipped)[0].spec
-        specs = searched, shipped_run(tuning, job.root).spec
-        if line := search_line(algo, *map(planned_outlook, specs)):
-            lines.append(f"engine: {line}")
-    for line in lines:
-        say(job.console, line)
-
-
-_STATES = {"COMPLETE": "judged to the end", "PRUNED": "ended early", "FAIL": "failed"}
+    words = f"{search.n_trials} trials of up to {len(search.tuning.seeds)} seeds, {n_there} of "
+    words += f"them there already; {suggestions.n_free} settings to choose; {job.workers.words}"
+    say(job.console, f"{words}, in {job.root}")
+    if mark := unproven_mark(search.tuning):
+        say(job.console, f"scores are{mark}")
+    for name in suggestions.space.widened:
+        say(job.console, f"{name}: the search space is widened to hold the shipped value")
 
 
 def print_search(console: Console, search: Search) -> None:
     """Print the cost of the search, and whether several settings reach the optimum."""
     from rl_yardstick.tuning.searching import FAILURE, outcomes_of
 
-    trials, n_seeds = search.trials, len(search.tuning.seeds)
+    trials, n_runs = search.trials, search.n_trials * len(search.tuning.seeds)
     states = Counter(
-        "failed" if FAILURE in trial.user_attrs else _STATES.get(trial.state.name, "to do")
-        for trial in trials
+        "failed" if FAILURE in trial.user_attrs else trial.state.name.lower() for trial in trials
     )
-    states["to do"] += search.n_trials - len(trials)
     runs = [run for trial in trials for run in outcomes_of(trial).values()]
-    counts = ", ".join(f"{count} {state}" for state, count in (+states).items())
-    say(
-        console,
-        f"{search.n_trials} trials: {counts}; {len(runs)} of {search.n_trials * n_seeds} runs, "
-        f"{sum(run.seconds for run in runs):,.0f} s of processor time",
-    )
+    counts = ", ".join(f"{count} {state}" for state, count in states.items())
+    spent = f"{sum(run.seconds for run in runs):,.0f} s of processor time"
+    say(console, f"trials: {counts}; {len(runs)} of {n_runs} runs, {spent}")
     if (n := search.n_at_optimum) > 1:
-        text = f"{n} settings have the optimum on all seeds, so their scores are tied: they are "
-        text += "ranked by steps to the threshold"
+        say(console, f"{n} settings have the optimum on all seeds: the fastest are the best")
         if search.is_saturated and not search.is_done:
-            text += "; the search ends here, since more trials cannot score more (--metric steps "
-            text += "searches for the fastest)"
-        say(console, text)
+            say(console, "the search ends here (--metric steps searches for the fastest)")
 
 
 def print_outcome(console: Console, outcome: Outcome) -> None:
@@ -390,7 +321,7 @@ def print_winner(console: Console, search: Search, number: int, path: Path) -> N
     """Print how to train with the winner, and which of its settings differ from the shipped."""
     tuning = search.tuning
     words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id, "--conf-file"]
-    how = f"{called_as('train')} {shlex.join([*words, str(path)])}"
+    how = f"{cli.called_as('train')} {shlex.join([*words, str(path)])}"
     say(console, f"winner: trial {number}, in {path}: {how}")
     shipped, entry = search.suggestions.shipped, search.trials[number].user_attrs["settings"]
     for key in {**shipped, **entry}:

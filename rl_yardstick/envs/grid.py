@@ -23,7 +23,7 @@ from rl_yardstick.envs.finite_env import (
     summing_to_one,
 )
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints, TransitionModel
-from rl_yardstick.safe_files.files import UnsafeFileError, read_file
+from rl_yardstick.safe_files.files import UnsafeFileError, content_of
 
 START = "S"
 GOAL = "G"
@@ -147,7 +147,7 @@ def read_rows(desc: Description) -> tuple[str, ...]:
     """The rows of a map, not checked yet; see `GridMap.read`."""
     if _is_path(desc):
         try:
-            text = read_file(Path(desc), MAX_MAP_BYTES).decode("utf-8-sig")
+            text = content_of(Path(desc), MAX_MAP_BYTES).decode("utf-8-sig")
         except (OSError, UnsafeFileError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise ValueError(f"desc: cannot read the map file {desc}: {reason}") from error

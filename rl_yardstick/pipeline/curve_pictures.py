@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.files import replacing
 from rl_yardstick.pipeline.run import LAST_PULLS
-from rl_yardstick.safe_files.files import NO_LIMIT, read_file
+from rl_yardstick.safe_files.files import NO_LIMIT, content_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +52,7 @@ MAX_POINTS = 5000
 
 def read_monitors(folder: Path) -> tuple[Floats, Floats]:
     """For each training episode, its last step counted over all environments, and its return."""
-    contents = [read_file(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
+    contents = [content_of(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
     rows = [
         np.loadtxt(BytesIO(content), delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
         for content in contents

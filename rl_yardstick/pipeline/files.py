@@ -18,7 +18,7 @@ from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.safe_files.files import UnsafeFileError, read_file
+from rl_yardstick.safe_files.files import UnsafeFileError, content_of
 
 MAX_TEXT = 10_000_000  # bytes of a settings file
 MAX_ARRAYS = 1 << 31  # bytes of an archive of arrays
@@ -41,7 +41,7 @@ def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
 def read_bytes(path: Path, limit: int = MAX_TEXT) -> bytes:
     """The content of a regular file of at most ``limit`` bytes; UserError if it is none."""
     try:
-        return read_file(path, limit)
+        return content_of(path, limit)
     except UnsafeFileError as error:
         raise UserError(str(error)) from error
     except OSError as error:
@@ -71,7 +71,7 @@ def read_arrays(
 
     ``shapes`` has the names of arrays and of their axes: those of one name have the same length.
     """
-    from rl_yardstick.safe_files.archives import read_members
+    from rl_yardstick.safe_files.files import read_members
 
     found: dict[str, NDArray[Any]] = {}
     lengths: dict[str, int] = {}

@@ -156,7 +156,7 @@ def replay_buffer_of(model: Path) -> Path | None:
 
 def zip_data(path: Path) -> dict[str, Any]:
     """The JSON in an agent's zip; pickles in it stay text."""
-    from rl_yardstick.safe_files.archives import first_look
+    from rl_yardstick.safe_files.files import first_look
 
     content = read_bytes(path, MAX_MODEL)
     try:

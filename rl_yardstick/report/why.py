@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -99,18 +99,6 @@ def _state(state: StateLoss, gap: float) -> str:
             told = [f"{one}, {n:,} updates" for one, n in zip(told, state.updates, strict=True)]
         text += f" ({state.action}: {told[0]}; {state.best}: {told[1]})"
     return text
-
-
-def course_lines(course: Mapping[int, Explanation]) -> list[str]:
-    """A table of the gap and its parts by the steps of training."""
-    names = list(dict.fromkeys(part.name for one in course.values() for part in one.parts))
-    rows = [["steps", "gap", *names]]
-    for steps, one in course.items():
-        losses = {part.name: part.loss for part in one.parts}
-        parts = [f"{losses[name]:.4g}" if name in losses else "" for name in names]
-        rows.append([f"{steps:,}", f"{one.gap:.4g}", *parts])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(map(str.rjust, row, widths)) for row in rows]
 
 
 def as_words(change: str) -> str:

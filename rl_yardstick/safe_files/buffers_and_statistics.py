@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
@@ -15,15 +15,11 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from rl_yardstick.safe_files.files import (
-    MAX_BUFFER_BYTES,
-    MAX_STATISTICS_BYTES,
-    Source,
-    UnsafeFileError,
-    content_of,
-)
+from rl_yardstick.safe_files.files import Source, UnsafeFileError, content_of
 from rl_yardstick.safe_files.known_objects import by_name, filled, read_pickle
 from rl_yardstick.safe_files.pickles import Build, Made, fields, wrong
+
+_MAX_BYTES = 32 << 30
 
 # --- replay buffers -------------------------------------------------------------------------------
 
@@ -33,42 +29,23 @@ _ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "ti
 
 
 def load_replay_buffer(
-    model: OffPolicyAlgorithm,
-    path: Source,
-    truncate_last_traj: bool = True,
-    *,
-    classes: Iterable[type[ReplayBuffer]] = (),
+    model: OffPolicyAlgorithm, path: Source, *, classes: Iterable[type[ReplayBuffer]] = ()
 ) -> None:
-    """Like ``model.load_replay_buffer``, but runs no code from the file.
+    """Like ``model.load_replay_buffer`` of a path or stream, but runs no code from the file.
 
-    Args:
-        model: the agent to give the buffer to.
-        path: the file, or a stream of its bytes.
-        truncate_last_traj: with `HerReplayBuffer`, end the unfinished episode in the buffer.
-        classes: your own subclasses of `ReplayBuffer` that the file may name.
+    ``classes`` are your own subclasses of `ReplayBuffer` that the file may name.
 
     Raises:
         UnsafeFileError: if the file is not a replay buffer, or does not fit the model.
     """
     makers = {name: partial(filled, cls) for name, cls in by_name([*_CLASSES, *classes]).items()}
-    buffer = read_pickle(content_of(path, MAX_BUFFER_BYTES), makers=makers)
+    buffer = read_pickle(content_of(path, _MAX_BYTES), makers=makers)
     if not isinstance(buffer, ReplayBuffer):
         raise UnsafeFileError("holds no replay buffer")
+    state = vars(buffer)
     for name in ("observation_space", "action_space"):
-        if vars(buffer).get(name) != getattr(model, name):
+        if state.get(name) != getattr(model, name):
             raise UnsafeFileError(f"holds transitions of another {name} than the agent's")
-    _check_rows(vars(buffer))
-    buffer.device = model.device
-    if isinstance(buffer, HerReplayBuffer):
-        assert model.env is not None, "HerReplayBuffer needs an environment"
-        buffer.set_env(model.env)
-        if truncate_last_traj:
-            buffer.truncate_last_trajectory()
-    model.replay_buffer = buffer
-
-
-def _check_rows(state: Mapping[str, Any]) -> None:
-    """Check that the arrays have the buffer's rows, and finite numbers."""
     for name in _ROWS:
         held = state.get(name, {})
         for array in held.values() if isinstance(held, dict) else [held]:
@@ -76,11 +53,16 @@ def _check_rows(state: Mapping[str, Any]) -> None:
             is_finite = array.dtype == object if name == "infos" else np.isfinite(array).all()
             if not (fits and is_finite):
                 raise UnsafeFileError(f"holds a replay buffer with wrong {name}")
+    buffer.device = model.device
+    if isinstance(buffer, HerReplayBuffer):
+        assert model.env is not None, "HerReplayBuffer needs an environment"
+        buffer.set_env(model.env)
+        buffer.truncate_last_trajectory()
+    model.replay_buffer = buffer
 
 
 # --- statistics -----------------------------------------------------------------------------------
 
-_VEC_NORMALIZE = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
 _SETTINGS = ["training", "norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon"]
 _REST = ("observation_space", "obs_rms", "ret_rms")
 
@@ -91,8 +73,7 @@ class Normalization:
 
     settings: dict[str, Any]  # its constructor's arguments
     observation_space: spaces.Space[Any]
-    # A dictionary for Dict observations, None if observations are not normalised.
-    obs_rms: RunningMeanStd | dict[str, RunningMeanStd] | None
+    obs_rms: RunningMeanStd | dict[str, RunningMeanStd] | None  # None if it does not normalise them
     ret_rms: RunningMeanStd
 
 
@@ -102,7 +83,7 @@ def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
     Raises:
         UnsafeFileError: if the file has no such statistics, or they do not fit the environments.
     """
-    found = read_normalization(content_of(path, MAX_STATISTICS_BYTES))
+    found = read_normalization(content_of(path, _MAX_BYTES))
     known, space = found.observation_space, venv.observation_space
     if type(known) is not type(space) or known.shape != space.shape:
         raise UnsafeFileError(f"holds statistics of {known}, not of {space}")
@@ -115,7 +96,7 @@ def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
 
 def read_normalization(pickled: bytes) -> Normalization:
     """Read the statistics in a pickled `VecNormalize`."""
-    found = read_pickle(pickled, makers={_VEC_NORMALIZE: _normalization})
+    found = read_pickle(pickled, makers=dict.fromkeys(by_name([VecNormalize]), _normalization))
     if not isinstance(found, Normalization):
         raise UnsafeFileError("holds no statistics of VecNormalize")
     return found

@@ -1,40 +1,30 @@
-"""Opens files of unknown origin, and limits the memory that reading them may take."""
+"""Opens files and zips of unknown origin, within a budget of memory; imports no libraries."""
 
 from __future__ import annotations
 
 import io
-import os
+import json
 import stat
-import sys
-from contextlib import suppress
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 NO_LIMIT = 1 << 62  # bytes
-# A model of a hundred million parameters is larger than any that these algorithms train.
-MAX_ARCHIVE_BYTES = 1 << 30
-MAX_STATISTICS_BYTES = 64 << 20
-MAX_BUFFER_BYTES = 32 << 30
+MAX_ARCHIVE_BYTES = 1 << 30  # a model of a hundred million parameters and more
 # Reading a file may take this multiple of its size, plus these bytes.
-_TIMES = 5
-_FREE_BYTES = 64 << 20
-# An empty dictionary and its slot in a container: no value takes more in addition to its text.
-_BYTES_PER_JSON_VALUE = 100
+_TIMES, _FREE_BYTES = 5, 64 << 20
+_BYTES_PER_JSON_VALUE = 100  # an empty dictionary and its slot in a container, besides the text
 
-# A file to read: a path, or a stream of bytes that were read already.
-Source = Path | str | io.BufferedIOBase
+Source = Path | str | io.BufferedIOBase  # a file to read, or a stream of its bytes
 
 
 class UnsafeFileError(ValueError):
-    """A file has forbidden contents, is damaged, or is too large; the message is one line.
-
-    Attributes:
-        key: the faulty entry of a model file, or None.
-    """
+    """A file is forbidden, damaged or too large; ``key`` is a model's faulty entry, or None."""
 
     def __init__(self, message: str, key: str | None = None) -> None:
-        # Control characters are escaped.
-        signs = (c if c.isprintable() else repr(c)[1:-1] for c in " ".join(message.split()))
-        super().__init__("".join(signs))
+        line = " ".join(message.split())
+        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in line))
         self.key = key
 
 
@@ -54,23 +44,14 @@ class Budget:
         """Charge ``n_bytes``; raises UnsafeFileError if fewer are left."""
         self.left -= n_bytes
         if self.left < 0:
-            raise UnsafeFileError(
-                f"would take more memory than {_TIMES} times its size and {_FREE_BYTES >> 20} MB"
-            )
+            most = f"{_TIMES} times its size and {_FREE_BYTES >> 20} MB"
+            raise UnsafeFileError(f"would take more memory than {most}")
 
     def charge_json(self, text: bytes) -> None:
         """Charge the memory of parsing a JSON text; see `charge`."""
         # One non-ASCII character can make all others of a text four bytes wide.
         self.charge(len(text) * (2 if text.isascii() else 8))
         self.charge(sum(map(text.count, (b"[", b"{", b",", b":"))) * _BYTES_PER_JSON_VALUE)
-
-
-def memory_bytes() -> int:
-    """The memory of this machine in bytes; 16 GB if the system does not report it."""
-    if sys.platform != "win32":
-        with suppress(ValueError, OSError):
-            return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return 16 << 30
 
 
 def opened(path: Path, limit: int) -> io.BufferedReader:
@@ -83,17 +64,77 @@ def opened(path: Path, limit: int) -> io.BufferedReader:
     return path.open("rb")
 
 
-def read_file(path: Path, limit: int) -> bytes:
-    """Read a whole regular file of at most ``limit`` bytes."""
-    with opened(path, limit) as file:
-        return file.read()
-
-
 def content_of(source: Source, limit: int) -> bytes:
     """Read a whole regular file or stream of at most ``limit`` bytes."""
     if not isinstance(source, io.BufferedIOBase):
-        return read_file(Path(source), limit)
+        with opened(Path(source), limit) as file:
+            return file.read()
     content = source.read(limit + 1)
     if len(content) > limit:
         raise UnsafeFileError(f"is larger than {limit:,} bytes")
     return content
+
+
+# --- zips of models -------------------------------------------------------------------------------
+
+SETTINGS = "data"
+_TEXTS = frozenset({SETTINGS, "_stable_baselines3_version", "system_info.txt"})
+TENSORS = ".pth"  # the ending of files of tensors
+
+# The signature of each entry in a zip's directory, and the bytes of Python's object for it.
+_ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
+# The library stores members uncompressed. A repacked zip may deflate them; then the budget is
+# charged twice the unpacked size, because Python joins the pieces.
+_COPIES = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 2}
+
+
+def read_members(content: bytes, budget: Budget | None = None) -> dict[str, bytes]:
+    """Read the members of a zip, stored or deflated, by name, within the budget."""
+    budget = budget or Budget(len(content))
+    budget.charge(content.count(_ENTRY) * _BYTES_PER_ENTRY)
+    members = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            infos = archive.infolist()
+            if any(info.compress_type not in _COPIES for info in infos):
+                raise UnsafeFileError("has a compression method that is not read here")
+            budget.charge(sum(info.file_size * _COPIES[info.compress_type] for info in infos))
+            for info in infos:
+                with archive.open(info) as member:  # may hold more than it declares
+                    members[info.filename] = member.read(info.file_size)
+                if len(members[info.filename]) != info.file_size:
+                    raise UnsafeFileError(f"{shown(info.filename)} is cut off")
+    except UnsafeFileError:
+        raise
+    except Exception as error:  # damaged, encrypted, or of an unknown kind
+        raise UnsafeFileError(f"is no whole zip: {error}") from error
+    return members
+
+
+def read_model_members(content: bytes, budget: Budget) -> dict[str, bytes]:
+    """Read the members of a model's zip; refuses others than models have."""
+    members = read_members(content, budget)
+    for name in members:
+        if name not in _TEXTS and not name.endswith(TENSORS):
+            raise UnsafeFileError(f"holds {shown(name)}, which no model file has")
+    if SETTINGS not in members or not any(name.endswith(TENSORS) for name in members):
+        raise UnsafeFileError("lacks parts that a model has")
+    return members
+
+
+def first_look(content: bytes) -> dict[str, Any]:
+    """Read the settings in a model's zip, without the libraries; pickled settings stay text."""
+    budget = Budget(len(content))
+    return parse_settings(read_model_members(content, budget), budget)
+
+
+def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, Any]:
+    """Parse the settings of a model, which are JSON."""
+    budget.charge_json(members[SETTINGS])
+    try:
+        data = json.loads(members[SETTINGS].decode())
+    except (ValueError, RecursionError) as error:
+        raise UnsafeFileError(f"has settings that are no JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise UnsafeFileError("has settings that do not map names to values")
+    return data

@@ -26,18 +26,9 @@ from torch import nn, optim
 from torch.distributions.transforms import AffineTransform, ComposeTransform, ExpTransform
 from torch.nn.modules import activation
 
-from rl_yardstick.safe_files.archives import read_members
-from rl_yardstick.safe_files.files import Budget, UnsafeFileError, shown
-from rl_yardstick.safe_files.pickles import (
-    PERSISTENT_ID,
-    Build,
-    Made,
-    Maker,
-    Reader,
-    fields,
-    pairs,
-    wrong,
-)
+from rl_yardstick.safe_files import pickles
+from rl_yardstick.safe_files.files import Budget, UnsafeFileError, read_members, shown
+from rl_yardstick.safe_files.pickles import Build, Made, Maker, fields, pairs, wrong
 
 
 def by_name(classes: Iterable[type]) -> dict[str, type]:
@@ -75,16 +66,14 @@ def _array(data: Any, dtype: Any, shape: Any, order: Any = "C") -> NDArray[Any]:
     if isinstance(data, list) is not dtype.hasobject:
         raise TypeError("an array of objects has a list of them, others have bytes")
     flat = np.fromiter(data, object) if dtype.hasobject else np.frombuffer(data, dtype)
-    # A copy, because an array on bytes is read-only.
-    return flat.reshape(shape, order=order).copy(order=order)
+    return flat.reshape(shape, order=order).copy(order=order)  # an array on bytes is read-only
 
 
 def _from_buffer(made: Made, build: Build) -> NDArray[Any]:
     data, dtype, shape, order, *axes = build(made.args)
-    if not axes:
-        return _array(data, dtype, shape, order)
-    # Since NumPy 2.3, for an array with another memory order of its axes.
-    return _array(data, dtype, shape).transpose(axes[0])
+    if axes:  # since NumPy 2.3, for an array with another memory order of its axes
+        return _array(data, dtype, shape).transpose(axes[0])
+    return _array(data, dtype, shape, order)
 
 
 def _reconstructed(made: Made, build: Build) -> NDArray[Any]:
@@ -101,10 +90,9 @@ def _generator(made: Made, build: Build) -> np.random.Generator:
     """A PCG64 generator: NumPy 2 pickles an inner generator, NumPy 1 its name and the state."""
     inner = made.args[0]
     state = inner.state if isinstance(inner, Made) else made.state
-    # NumPy 2 adds the seeds, from which other generators can be spawned: they are left out.
-    state = build(state[0] if isinstance(state, tuple) else state)
     generator = np.random.Generator(np.random.PCG64())
-    generator.bit_generator.state = state
+    # NumPy 2 adds the seeds, from which other generators can be spawned: they are left out.
+    generator.bit_generator.state = build(state[0] if isinstance(state, tuple) else state)
     return generator
 
 
@@ -126,9 +114,7 @@ _CLASSES_OF_NUMPY: Mapping[str, type] = {
 # --- tensors --------------------------------------------------------------------------------------
 
 # PyTorch's own reader unpickles classes, and a few bytes can declare a tensor of any size. Here a
-# tensor is built from the bytes of its storage, and has no more elements than its storage.
-
-# Real numbers alone.
+# tensor of real numbers has no more elements than the bytes of its storage.
 _DTYPES: Mapping[str, th.dtype] = {
     f"torch.{kind}Storage": getattr(th, kind.lower())
     for kind in ("Bool", "Short", "Int", "Long", "Half", "BFloat16", "Float", "Double")
@@ -154,8 +140,8 @@ def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
             budget.charge(storages[key].nbytes)
             return storages[key]
 
-        tree = Reader(io.BytesIO(members.get("data.pkl", b"")), budget).load()
-        return Build({**_OF_TENSORS, PERSISTENT_ID: storage}, {}, budget)(tree)
+        tree = pickles.Reader(io.BytesIO(members.get("data.pkl", b"")), budget).load()
+        return Build({**_OF_TENSORS, pickles.PERSISTENT_ID: storage}, {}, budget)(tree)
     except UnsafeFileError as error:
         raise UnsafeFileError(f"holds tensors that cannot be read: {error}") from error
 
@@ -174,7 +160,7 @@ def _flat(pid: Any, content: bytes) -> th.Tensor:
 def _lone_storage(made: Made, build: Build) -> th.Tensor:
     """A storage in the legacy format, which PyTorch uses for tensors in other pickles."""
     file = io.BytesIO(*made.args)
-    reader = Reader(file, build.budget)
+    reader = pickles.Reader(file, build.budget)
     # Three headers precede the storage; a list of keys and the size follow it.
     storage = [reader.load() for _ in range(5)][3]
     return _flat(storage.args[0], file.read()[8:])
@@ -188,13 +174,11 @@ def _tensor(made: Made, build: Build) -> th.Tensor:
     return tensor.requires_grad_(bool(requires_grad))
 
 
-def _ordered(made: Made, build: Build) -> OrderedDict[Any, Any]:
-    """An OrderedDict, without the versions of modules that PyTorch gives it."""
-    return OrderedDict((key, build(value)) for key, value in pairs(made))
-
-
 _OF_TENSORS: Mapping[str, Maker] = {
-    "collections.OrderedDict": _ordered,
+    # Without the versions of modules that PyTorch gives it.
+    "collections.OrderedDict": lambda made, build: OrderedDict(
+        (key, build(value)) for key, value in pairs(made)
+    ),
     "torch._utils._rebuild_tensor_v2": _tensor,
     "torch._utils._rebuild_parameter": lambda made, build: build(made.args[0]),
     "torch.storage._load_from_bytes": _lone_storage,
@@ -222,8 +206,7 @@ def check_values(files: Mapping[str, Any]) -> None:
 
 _FILLED = (
     *(ConstantSchedule, LinearSchedule, FloatSchedule),
-    # Schedules from PyTorch classes, such as exp(a + b x).
-    *(AffineTransform, ComposeTransform, ExpTransform),
+    *(AffineTransform, ComposeTransform, ExpTransform),  # schedules such as exp(a + b x)
     *(noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise),
     *(spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary),
     *(spaces.Dict, spaces.Tuple, RunningMeanStd),
@@ -235,24 +218,17 @@ def _called(make: Callable[..., Any], made: Made, build: Build) -> Any:
     return make(*build(made.args))
 
 
-def _deque(made: Made, build: Build) -> deque[Any]:
-    # The arguments are its contents, always empty, and its maximum length.
-    return deque(build(made.items), *build(made.args[1:2]))
-
-
-def _proportional(made: Made, build: Build) -> AffineTransform:
-    return AffineTransform(0.0, fields(made, build)["initial_value"])
-
-
 _MAKERS: Mapping[str, Maker] = {
     **_OF_TENSORS,
     **_OF_NUMPY,
     **{name: partial(filled, cls) for name, cls in by_name(_FILLED).items()},
     **{name: partial(_called, cls) for name, cls in by_name(_CALLED).items()},
-    "collections.deque": _deque,
-    "rl_zoo3.utils.SimpleLinearSchedule": _proportional,
-    # The caller chooses the device.
-    "torch.device": lambda made, build: th.device("cpu"),
+    # The arguments are its contents, always empty, and its maximum length.
+    "collections.deque": lambda made, build: deque(build(made.items), *build(made.args[1:2])),
+    "rl_zoo3.utils.SimpleLinearSchedule": lambda made, build: AffineTransform(
+        0.0, fields(made, build)["initial_value"]
+    ),
+    "torch.device": lambda made, build: th.device("cpu"),  # the caller chooses
 }
 
 
@@ -280,6 +256,6 @@ def read_pickle(
 ) -> Any:
     """Build the value of a pickle without unpickling; arguments allow further objects."""
     budget = budget or Budget(len(pickled))
-    tree = Reader(io.BytesIO(pickled), budget).load()
+    tree = pickles.Reader(io.BytesIO(pickled), budget).load()
     build = Build({**_MAKERS, **(makers or {})}, {**_library_classes(), **(classes or {})}, budget)
     return build(tree)

@@ -1,8 +1,7 @@
 """Loads models of Stable-Baselines3 and sb3-contrib from files of unknown origin.
 
 The library's own `load` gets a new zip with the checked contents, so it has nothing to unpickle.
-This module also checks sizes, because `load` would make networks and buffers of any size in the
-settings.
+Sizes are checked, because it would make networks and buffers of any size in the settings.
 """
 
 from __future__ import annotations
@@ -12,6 +11,8 @@ import contextlib
 import inspect
 import io
 import json
+import os
+import sys
 import textwrap
 import zipfile
 from collections.abc import Mapping
@@ -23,22 +24,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from torch.overrides import TorchFunctionMode
 
-from rl_yardstick.safe_files.archives import (
-    SETTINGS,
-    TENSORS,
-    parse_settings,
-    read_model_members,
-)
-from rl_yardstick.safe_files.files import (
-    MAX_ARCHIVE_BYTES,
-    Budget,
-    Source,
-    UnsafeFileError,
-    content_of,
-    memory_bytes,
-    read_file,
-    shown,
-)
+from rl_yardstick.safe_files import files
+from rl_yardstick.safe_files.files import SETTINGS, TENSORS, Budget, Source, UnsafeFileError, shown
 from rl_yardstick.safe_files.known_objects import (
     by_name,
     check_values,
@@ -48,9 +35,6 @@ from rl_yardstick.safe_files.known_objects import (
 )
 from rl_yardstick.safe_files.pickles import Reader
 
-# Files of trained variables outside networks; the second name is the older one.
-_VARIABLES = ("pytorch_variables.pth", "tensors.pth")
-
 # Attributes that models do not keep: the caller sets them, regardless of the file.
 _NOT_KEPT = frozenset(
     {"env", "device", "policy", "rollout_buffer", "replay_buffer", "_logger", "_custom_logger"}
@@ -59,9 +43,6 @@ _NOT_KEPT = frozenset(
 # The caller's as well, or rebuilt from the learning rate and the exploration settings.
 _NOT_READ = _NOT_KEPT | {"tensorboard_log", "lr_schedule", "exploration_schedule"}
 _SERIALIZED = ":serialized:"
-
-# Types of a class's default value of an attribute.
-_PLAIN = (bool, int, float, str, type(None))
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
@@ -76,7 +57,7 @@ def load_model(
     custom_objects: Mapping[str, Any] | None = None,
     **replaced: Any,
 ) -> Algorithm:
-    """Like ``algorithm.load``, but runs no code from the file.
+    """Like ``algorithm.load`` of a path or a stream, but runs no code from the file.
 
     Args:
         algorithm: a class of Stable-Baselines3, sb3-contrib, or your own with the same interface.
@@ -85,16 +66,20 @@ def load_model(
         device: the device of the tensors.
         classes: your own classes that the file may name, by their full names.
         custom_objects: values that replace attributes in the file, which are then not read.
-        replaced: attributes to set, also if the file lacks them; the file's values are not read.
+        replaced: the same, also for attributes that the file lacks.
 
     Raises:
         UnsafeFileError: if the file has forbidden contents, is damaged, or is too large.
         ValueError: if the model does not fit ``env``; the message is the library's.
     """
-    content = content_of(path, MAX_ARCHIVE_BYTES)
+    content = files.content_of(path, files.MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
-    members = read_model_members(content, budget)
-    settings = _read_settings(members, algorithm, budget)
+    members = files.read_model_members(content, budget)
+    raw = files.parse_settings(members, budget)
+    settings = {key: _decoded(value) for key, value in raw.items() if key not in _NOT_READ}
+    for key in settings:
+        if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
+            raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
     known = {**by_name(algorithm.policy_aliases.values()), **(classes or {})}
     objects = {name: held for name, held in (custom_objects or {}).items() if name in settings}
     pickled = {name: held for name, held in settings.items() if isinstance(held, bytes)}
@@ -110,7 +95,14 @@ def load_model(
         _check_variables(tensors, algorithm)
         _check_buffers({**settings, **objects, **replaced})
         # The library applies only custom objects whose keys are in the file.
-        checked = _zipped({**settings, **dict.fromkeys([*pickled, *objects])}, tensors)
+        data = {**settings, **dict.fromkeys([*pickled, *objects])}
+        checked = io.BytesIO()
+        with zipfile.ZipFile(checked, "w") as archive:
+            archive.writestr(SETTINGS, json.dumps(data))
+            for name in names:  # what is written needs no second place in memory
+                with archive.open(name, "w") as member:
+                    th.save(tensors.pop(name), member)
+        checked.seek(0)
         with charged_tensors(budget):
             return algorithm.load(checked, env, device, objects, **replaced)
     except ValueError:
@@ -120,21 +112,10 @@ def load_model(
         raise UnsafeFileError(f"holds no such model: {reason}") from error
 
 
-def _read_settings(
-    members: Mapping[str, bytes], algorithm: type[BaseAlgorithm], budget: Budget
-) -> dict[str, Any]:
-    """The attributes in a zip; pickles are bytes."""
-    settings = parse_settings(members, budget)
-    read = {key: _decoded(value) for key, value in settings.items() if key not in _NOT_READ}
-    for key in read:
-        if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
-            raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
-    return read
-
-
 def hides(algorithm: type, name: str) -> bool:
     """Whether an attribute of that name would hide a class member other than a plain default."""
-    return not isinstance(inspect.getattr_static(algorithm, name, None), _PLAIN)
+    default = inspect.getattr_static(algorithm, name, None)
+    return not isinstance(default, bool | int | float | str | None)
 
 
 def _decoded(value: Any) -> Any:
@@ -153,22 +134,10 @@ def _check_variables(tensors: Mapping[str, Any], algorithm: type[BaseAlgorithm])
     # For the libraries' classes, an empty instance is enough, or these are the variables.
     with contextlib.suppress(AttributeError):
         known |= set(algorithm._get_torch_save_params(algorithm.__new__(algorithm))[1])
-    for name in _VARIABLES:
+    for name in ("pytorch_variables.pth", "tensors.pth"):  # the second is the older one
         for key in tensors.get(name, {}):
             if key not in known:
                 raise UnsafeFileError(f"sets {shown(key)}, which is no variable of a model")
-
-
-def _zipped(data: Mapping[str, Any], tensors: dict[str, Any]) -> io.BytesIO:
-    """Write a new zip of the checked contents; takes the tensors from the dictionary."""
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
-        archive.writestr(SETTINGS, json.dumps(data))
-        for name in list(tensors):
-            with archive.open(name, "w") as member:
-                th.save(tensors.pop(name), member)
-    content.seek(0)
-    return content
 
 
 # --- sizes ----------------------------------------------------------------------------------------
@@ -180,8 +149,7 @@ _MAKERS = frozenset(
     {th.empty, th.zeros, th.ones, th.full, th.rand, th.randn, th.eye, th.arange, th.Tensor.repeat}
     | {th.empty_like, th.zeros_like, th.ones_like, th.Tensor.clone, th.clone}
 )
-# Python's overhead of a tensor and its layer.
-_BYTES_PER_TENSOR = 4096
+_BYTES_PER_TENSOR = 4096  # Python's overhead of a tensor and its layer
 
 
 class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a function is
@@ -191,23 +159,25 @@ class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a funct
         super().__init__()
         self.budget = budget
 
-    def __torch_function__(
-        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if function in _MAKERS:
+        if func in _MAKERS:
             # PyTorch's device for tensors without memory.
             like = [arg.to("meta") if isinstance(arg, th.Tensor) else arg for arg in args]
             where = {} if like and isinstance(like[0], th.Tensor) else {"device": "meta"}
-            self.budget.charge(function(*like, **{**kwargs, **where}).nbytes + _BYTES_PER_TENSOR)
-        return function(*args, **kwargs)
+            self.budget.charge(func(*like, **{**kwargs, **where}).nbytes + _BYTES_PER_TENSOR)
+        return func(*args, **kwargs)
 
 
 def _check_buffers(settings: Mapping[str, Any]) -> None:
     """Check that the buffers in the settings fit into memory."""
+    most = 16 << 30  # bytes, if the system does not report its memory
+    if sys.platform != "win32":
+        with contextlib.suppress(ValueError, OSError):
+            most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     row = get_flattened_obs_dim(settings["observation_space"]) * _BYTES_PER_NUMBER + _BYTES_PER_INFO
     for name, factor in (("buffer_size", 1), ("n_steps", settings.get("n_envs", 1))):
-        if not 0 < settings.get(name, 1) * factor * row <= memory_bytes():
+        if not 0 < settings.get(name, 1) * factor * row <= most:
             raise UnsafeFileError(f"does not fit into memory here: give another {name}", name)
 
 
@@ -221,31 +191,29 @@ def inspect_model(path: Path | str) -> dict[str, dict[str, str]]:
         for each of ``"members"``, ``"weights"``, ``"settings"`` and ``"suspicious"``, texts of one
         line by name.
     """
-    content = read_file(Path(path), MAX_ARCHIVE_BYTES)
+    content = files.content_of(path, files.MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
-    members = read_model_members(content, budget)
+    members = files.read_model_members(content, budget)
     found: dict[str, dict[str, str]] = {"members": {}, "weights": {}, "settings": {}}
-    doubts: dict[str, str] = {}
-    for key, value in parse_settings(members, budget).items():
+    found["suspicious"] = {}
+    for key, value in files.parse_settings(members, budget).items():
+        name = shown(key)[1:-1]
         try:
-            found["settings"][_quoted(key)] = _setting(key, value, budget)
+            found["settings"][name] = _setting(key, value, budget)
         except UnsafeFileError as error:
-            doubts[_quoted(key)] = str(error)
-    for name, held in members.items():
-        found["members"][_quoted(name)] = f"{len(held):,} bytes"
+            found["suspicious"][name] = str(error)
+    for member, held in members.items():
+        name = shown(member)[1:-1]
+        found["members"][name] = f"{len(held):,} bytes"
         try:
-            is_tensors, stem = name.endswith(TENSORS), name.removesuffix(TENSORS)
-            tensors = {stem: load_tensors(held, budget)} if is_tensors else {}
+            stem = member.removesuffix(TENSORS)
+            tensors = {stem: load_tensors(held, budget)} if stem != member else {}
             check_values(tensors)
             for where, tensor in tensors_in(tensors):
-                found["weights"][_quoted(where)] = str(tuple(tensor.shape))
+                found["weights"][shown(where)[1:-1]] = str(tuple(tensor.shape))
         except UnsafeFileError as error:
-            doubts[_quoted(name)] = str(error)
-    return {**found, "suspicious": doubts}
-
-
-def _quoted(name: str) -> str:
-    return shown(name).strip("'")
+            found["suspicious"][name] = str(error)
+    return found
 
 
 def _setting(key: str, value: Any, budget: Budget) -> str:
@@ -257,7 +225,7 @@ def _setting(key: str, value: Any, budget: Budget) -> str:
         return shown(value)
     reader = Reader(io.BytesIO(pickled), budget)
     reader.load()
-    names = [_quoted(name) for name in sorted(reader.names)]
+    names = [shown(name)[1:-1] for name in sorted(reader.names)]
     if key != "policy_class" or not names[0].startswith(("stable_baselines3.", "sb3_contrib.")):
         read_pickle(pickled, budget=budget)
     return "a pickle of " + (", ".join(names) or "plain data")

@@ -1,8 +1,7 @@
 """Reads pickles as data: records the requested calls, and builds objects by fixed tables.
 
-Python's own reader steps through a pickle. Instructions that ask for a class or a call only record
-the request: nothing is imported or called. From these records, `Build` makes the objects that the
-tables of `safe_files.known_objects` know, and refuses all others.
+Python's own reader steps through a pickle, and only records requests for classes and calls. `Build`
+makes the objects that the tables of `safe_files.known_objects` know, and refuses all others.
 """
 
 from __future__ import annotations
@@ -26,13 +25,11 @@ _NAMES = (
     "NEWOBJ BUILD BINPERSID"
 )
 INSTRUCTIONS = frozenset(_NAMES.split())
-# Bytes that an instruction, or a part of the built value, takes at most besides its text.
-_PRICE = 160
-# One character can make all others of a text four bytes wide.
-_BYTES_PER_SIGN = 4
+# Bytes that an instruction, or a part of the built value, takes at most besides its text; and those
+# of a sign, since one can make all others of a text four bytes wide.
+_PRICE, _BYTES_PER_SIGN = 160, 4
 MAX_DEPTH, MAX_INTEGER_BITS = 40, 128
-# Larger integers are not their own hash, so that any number of them can share one.
-_END_OF_KEYS = (1 << 61) - 1
+_END_OF_KEYS = (1 << 61) - 1  # larger integers are not their own hash: any number can share one
 # Packages that were renamed: NumPy's inner one, and Gym, whose spaces Gymnasium took over.
 _RENAMED = {"numpy.core.": "numpy._core.", "gym.spaces.": "gymnasium.spaces."}
 # The names of records of dictionaries and of persistent ids. Names in a file have a dot.
@@ -71,8 +68,7 @@ class Reader(pickle._Unpickler):
 
     def __init__(self, file: io.BytesIO, budget: Budget) -> None:
         super().__init__(file)
-        self.file = file
-        self.budget = budget
+        self.file, self.budget = file, budget
         self.names: set[str] = set()  # all names in the file
 
     def load(self) -> Any:
@@ -99,8 +95,7 @@ class Reader(pickle._Unpickler):
         """Record a name where Python would import a class, as it is in current libraries."""
         self.budget.charge(_BYTES_PER_SIGN * (len(module) + len(name)))
         full = f"{module}.{name}"
-        if module.startswith("cloudpickle."):
-            # Schedules before version 2.6 of the library were functions.
+        if module.startswith("cloudpickle."):  # as schedules before version 2.6 of the library
             raise UnsafeFileError("holds a function with its code")
         for old, new in _RENAMED.items():
             if full.startswith(old):
@@ -112,8 +107,7 @@ class Reader(pickle._Unpickler):
         return Made(PERSISTENT_ID, (pid,))
 
     def load_dictionary(self) -> None:
-        # Hashing the keys could take for ever.
-        self.append(Made(DICTIONARY, ()))
+        self.append(Made(DICTIONARY, ()))  # hashing the keys could take for ever
 
     def load_call(self) -> None:
         args, name = self.stack.pop(), self.stack.pop()
@@ -139,11 +133,7 @@ Maker = Callable[[Made, "Build"], Any]
 
 @dataclass
 class Build:
-    """Builds values from records, by tables of makers and classes with the full names in the file.
-
-    A shared part is built, and charged, at each of its places: ten bytes can ask for the same array
-    a thousand times.
-    """
+    """Builds values from records, a shared part at each of its places, by tables of full names."""
 
     makers: Mapping[str, Maker]
     classes: Mapping[str, type]
@@ -154,14 +144,13 @@ class Build:
         """Build a part of the tree; a part that contains itself is too deep."""
         n_bytes = len(tree) if isinstance(tree, str | bytes | bytearray) else 0
         self.budget.charge(_PRICE + n_bytes)
-        if not isinstance(tree, Name | Made | list | tuple):
-            return tree
-        self.depth += 1
-        if self.depth > MAX_DEPTH:
-            raise UnsafeFileError(f"is nested more than {MAX_DEPTH} deep")
-        value = self._make(tree)
-        self.depth -= 1
-        return value
+        if isinstance(tree, Name | Made | list | tuple):
+            self.depth += 1
+            if self.depth > MAX_DEPTH:
+                raise UnsafeFileError(f"is nested more than {MAX_DEPTH} deep")
+            tree = self._make(tree)
+            self.depth -= 1
+        return tree
 
     def _make(self, tree: Any) -> Any:
         if isinstance(tree, list | tuple):

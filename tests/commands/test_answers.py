@@ -18,8 +18,8 @@ def test_training_by_the_installed_name(type_command, tmp_path):
     words = [*LAKE, "--seed", "0", "-n", "500"]
     code, out, err = type_command("/venv/bin/yardstick", "train", *words)
     assert (code, err) == (0, "")
-    assert "watch    yardstick enjoy --algo qlearning --env FrozenLake-v1\n" in out
-    assert "explain  yardstick explain --algo qlearning --env FrozenLake-v1\n" in out
+    assert "watch    yardstick enjoy logs/qlearning/FrozenLake-v1_1\n" in out
+    assert "explain  yardstick explain logs/qlearning/FrozenLake-v1_1\n" in out
     assert max(map(len, out.splitlines())) <= 100
     run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
     written = (run / "FrozenLake-v1" / "command.txt").read_text()

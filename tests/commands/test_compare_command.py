@@ -102,19 +102,12 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(type_command,
     paths = (place / "sarsa" / "FrozenLake-v1_1" / "0.monitor.csv" for place in places)
     theirs, ours = (pd.read_csv(path, skiprows=1)[["r", "l"]] for path in paths)
     assert theirs.equals(ours)
-    # Finished runs of other settings are replaced only when that is asked for.
+    # Finished runs of other settings stay as they are.
     first, other = records(study), [*PAIR, "--seeds", 2, "-params", "gamma:0.9"]
     code, out, err = type_command(*other)
     assert (code, err.count("\n")) == (2, 1)
-    assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now): --name" in err
+    assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now): give" in err
     assert records(study) == first
-    code, out, _ = type_command(*other, "--replace")
-    assert (code, "4 runs, 0 of them there already" in out) == (0, True)
-    assert not set(records(study).values()) & set(first.values())
-    place = study / "replaced" / "1"
-    assert f"4 runs are done again: the old folders are in {place.relative_to(folder)} now" in out
-    place.rename(place.parent / "runs")
-    assert records(place.parent) == first
     # What a study's record says is enough to do it elsewhere.
     (folder / "copy").mkdir()
     (folder / "copy" / "study.json").write_bytes((study / "study.json").read_bytes())
@@ -122,7 +115,7 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(type_command,
     columns = ["agent", "seed", "final", "training", "n_timesteps"]
     assert rows(folder / "copy")[columns].equals(rows(study)[columns])
     code, _, err = type_command("--resume", "copy", "--seeds", 3)
-    assert (code, "leave out seeds" in err) == (2, True)
+    assert (code, "--seeds cannot be given with --resume" in err) == (2, True)
 
 
 def test_films_and_pages_of_training(type_command, folder, monkeypatch):
@@ -200,7 +193,7 @@ def states(study):
 def test_the_same_command_does_what_is_left(number, type_command, folder, begun):
     process, study, started = begun
     # A second command says that the folder is in use, and touches nothing.
-    code, _, err = type_command(*SLOW, "-params", "gamma:0.5", "--replace")
+    code, _, err = type_command(*SLOW, "-params", "gamma:0.5")
     assert (code, err.count("\n"), "in use by another command" in err) == (2, 1, True)
     if number == signal.SIGINT:
         os.killpg(process.pid, number)  # as a terminal sends it

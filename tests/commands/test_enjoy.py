@@ -72,7 +72,6 @@ CHOICES = {
 CHECKPOINTS = "holds no rl_model_50_steps.zip: there are checkpoints after 40, 80 steps"
 REFUSED = {
     "--n-envs 2 --render ansi": "--render ansi shows one environment",
-    "--fps 3": "--fps is the pace of --render ansi",
     "--record film.avi": "--record writes .gif files",
     "--record nowhere/film.gif": "there is no folder nowhere",
     "--norm-reward": "no statistics of VecNormalize belong to this model",
@@ -135,11 +134,11 @@ def test_pictures_replace_each_other_at_their_pace_with_figures_beside(tmp_path,
     monkeypatch.setattr(enjoy.time, "sleep", pauses.append)
     monkeypatch.setenv("TERM", "xterm")
     console = TextConsole(file=io.StringIO(), force_terminal=True, width=100, height=40)
-    words = ["--render", "ansi", "--n-episodes", "2", "--fps", "5"]
+    words = ["--render", "ansi", "--n-episodes", "2"]
     enjoy.play(console, found, enjoy.build_parser().parse_args(words))
     shown = console.file.getvalue()
     # Six steps to the goal: seven pictures an episode.
-    assert pauses.count(0.2) == 14
+    assert pauses.count(0.25) == 14
     assert shown.count("step 0") == 2
     assert REPLACED in shown
     assert "episode 1: return 1.00, 6 steps" in shown

@@ -48,17 +48,16 @@ def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, r
     assert code == 0
     assert [*tried] == ["as shipped", "as it is", "n_timesteps:60000", "gamma:0.5"]
     assert {len(returns) for returns in tried.values()} == {4}
-    assert "16 runs, about" in out
+    assert "16 runs, 0 of them there already" in out
     assert "n_timesteps:60000 helps most" in out
     assert "16 runs, 16 of them there already" in type_command("explain", run, *words)[1]
 
 
-def test_checkpoints_show_the_course(type_command, run, tmp_path):
-    words = ("--course", "--map", "costs.png", "--json", "why.json")
-    code = type_command("explain", run, *words)[0]
+def test_what_each_cell_costs_is_drawn_and_written_down(type_command, run, tmp_path):
+    code = type_command("explain", run, "--map", "costs.png", "--json", "why.json")[0]
     data = json.loads(Path("why.json").read_text())
     assert code == 0
-    assert [row["timesteps"] for row in data["course"]] == [1000, 2000, 3000]
+    assert sum(part["loss"] for part in data["parts"]) == pytest.approx(data["gap"])
     assert (tmp_path / "costs.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -67,7 +66,7 @@ def test_what_cannot_be_explained_is_refused_in_one_line(type_command, run):
     for words, line in (
         ([run, "--test", "gama:0.9"], "gama"),
         ([run, "--map", "costs.svg"], "--map writes a .png"),
-        ([cart, "--course"], "the model of CartPole-v1 is not known"),
+        ([cart], "the model of CartPole-v1 is not known"),
     ):
         code, _, err = type_command("explain", *words)
         assert (code, err.count("\n")) == (2, 1)

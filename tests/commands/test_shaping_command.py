@@ -70,8 +70,8 @@ def test_the_shipped_changes_of_warehouses_cost_nothing(shape):
 
 
 def test_a_potential_costs_nothing_and_a_bonus_for_every_step_forward_costs_all(shape):
-    walk = ("--gym-packages", "walk.py", "--env", "Walk-v0", "--gamma")
-    lines, data = shape(*walk, 0.9, "--train-env-kwargs", "scale:5")
+    walk = ("--gym-packages", "walk.py", "--env", "Walk-v0", "-params")
+    lines, data = shape(*walk, "gamma:0.9", "--train-env-kwargs", "scale:5")
     assert lines[1] == "discount 0.9: the same policies are optimal"
     assert lines[-1] == (
         "the changed rewards are the original ones plus the difference of a potential, "
@@ -80,7 +80,7 @@ def test_a_potential_costs_nothing_and_a_bonus_for_every_step_forward_costs_all(
     first = data["objectives"][0]
     assert (first["factor"], first["cost"]) == (1, pytest.approx([0, 0], abs=1e-9))
     assert first["potential"] == pytest.approx([0, 5, 10, 15])
-    lines, data = shape(*walk, 0.99, "--train-env-kwargs", "loop:10")
+    lines, data = shape(*walk, "gamma:0.99", "--train-env-kwargs", "loop:10")
     # The optimum goes straight on, for -1 -1 -1 +10; to and fro costs 1 in each of 20 steps.
     assert lines[1].startswith("discount 0.99: NOT the same policies are optimal: the best actions")
     places = data["objectives"][0]["states"]

@@ -14,13 +14,12 @@ import pytest
 import yaml
 
 from rl_yardstick.commands.terminal import result_lines
-from rl_yardstick.commands.train import describe_pulls, next_commands, other_agent, rows_of
+from rl_yardstick.commands.train import describe_pulls, next_commands, rows_of
 from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.pipeline.callbacks import PullSummary
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
 from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
 from rl_yardstick.pipeline.run import Run
-from tests.pipeline.short_runs import spec_of
 
 LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 TRAIN = str(Path(__file__).parents[2] / "train.py")
@@ -149,35 +148,16 @@ def test_what_was_done():
     ]
 
 
-def test_what_to_type_next(monkeypatch, tmp_path):
+def test_what_to_type_next(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py"])
-    monkeypatch.chdir(tmp_path)
-    entry = {"env_kwargs": {"is_slippery": False}, "engine": "auto", "n_episodes": 30}
-    spec = spec_of("qlearning", "FrozenLake-v1", entry)
-    run = Run.claim(Path("else where"), spec)
-    chosen = "--algo qlearning --env FrozenLake-v1 -f 'else where'"
-    compared = "python compare.py --env FrozenLake-v1 --algos qlearning sarsa"
+    run = Run(Path("else where/qlearning/FrozenLake-v1_1"))
     explained, plain = (SimpleNamespace(can_be_explained=one) for one in (True, False))
-    assert next_commands(spec, run, explained) == [
-        ("watch", f"python enjoy.py {chosen}"),
-        ("explain", f"python -m rl_yardstick explain {chosen}"),
-        ("compare", f"{compared} --env-kwargs is_slippery:False --seeds 10 --engine auto"),
+    assert next_commands(run, [], explained) == [
+        f"watch    python enjoy.py '{run.path}'",
+        f"explain  python -m rl_yardstick explain '{run.path}'",
     ]
-    older = run
-    Run.claim(Path("else where"), spec)
-    assert next_commands(spec, older, plain)[0] == ("watch", f"python enjoy.py '{run.path}'")
-
-
-@pytest.mark.parametrize(
-    ("algo", "env_id", "other"),
-    [
-        ("qlearning", "FrozenLake-v1", "sarsa"),
-        ("ppo", "Pendulum-v1", "sac"),
-        ("thompson", "BernoulliBandit-v0", "epsilon_greedy"),
-    ],
-)
-def test_the_other_agent_fits(algo, env_id, other):
-    assert other_agent(spec_of(algo, env_id)) == other
+    (watched,) = next_commands(run, ["mine"], plain)
+    assert watched == f"watch    python enjoy.py '{run.path}' --gym-packages mine"
 
 
 # --- whole commands -------------------------------------------------------------------------------

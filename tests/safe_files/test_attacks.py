@@ -21,9 +21,8 @@ from hypothesis import strategies as st
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.utils import ConstantSchedule
 
-from rl_yardstick.safe_files.archives import first_look
 from rl_yardstick.safe_files.buffers_and_statistics import load_replay_buffer, read_normalization
-from rl_yardstick.safe_files.files import UnsafeFileError
+from rl_yardstick.safe_files.files import UnsafeFileError, first_look
 from rl_yardstick.safe_files.known_objects import load_tensors, read_pickle
 from rl_yardstick.safe_files.models import inspect_model, load_model
 from rl_yardstick.safe_files.pickles import INSTRUCTIONS

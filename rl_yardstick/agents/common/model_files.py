@@ -32,12 +32,13 @@ from stable_baselines3.common.utils import (
 )
 
 from rl_yardstick.agents.common.schedules import ExponentialSchedule
-from rl_yardstick.safe_files.archives import parse_settings, read_model_members
 from rl_yardstick.safe_files.files import (
     MAX_ARCHIVE_BYTES,
     Budget,
     UnsafeFileError,
     content_of,
+    parse_settings,
+    read_model_members,
     shown,
 )
 from rl_yardstick.safe_files.known_objects import check_values, load_tensors

@@ -30,7 +30,7 @@ from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.pipeline.watching import TableRecorder, Watch
 from rl_yardstick.report.page import frame
 from rl_yardstick.report.page.frame import LearningPage, first_runs
-from rl_yardstick.safe_files.archives import read_members
+from rl_yardstick.safe_files.files import read_members
 
 
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
