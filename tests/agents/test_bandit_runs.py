@@ -18,8 +18,6 @@ from rl_yardstick.agents.compiled.worlds import NotCompilable
 
 COINS, NORMAL, SEGMENTS = "BernoulliBandit-v0", "GaussianBandit-v0", "SegmentBandit-v0"
 
-# --- feedback ------------------------------------------------------------------------------------
-
 
 class Script(gym.Env):
     """Tells the given infos one after the other; the reward is 1 for arm 1."""
@@ -72,8 +70,6 @@ def test_rewards_that_do_not_fit():
     with pytest.raises(ValueError, match="this environment's have normal noise"):
         load_algorithm("thompson")(env=NORMAL, seed=0).learn(1)
 
-
-# --- the compiled batch --------------------------------------------------------------------------
 
 COIN, VECTORS = (COINS, {}), ("LinearBandit-v0", {})
 SEGMENTED = SEGMENTS, {"batch_size": 7, "pulls": 240}
@@ -142,9 +138,6 @@ def test_what_cannot_be_compiled_is_refused(name, kwargs, env_id, more, line):
         run_batch(name, kwargs, env_id, {}, [0], **more)
 
 
-# --- MABWiser ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("ours", "theirs", "env_id", "kwargs"),
     [
@@ -160,9 +153,6 @@ def test_ours_and_theirs_pull_the_same_arms(ours, theirs, env_id, kwargs):
     assert np.array_equal(first.arms, second.arms)
     assert np.array_equal(first.rewards, second.rewards)
     assert len(set(first.arms[0].tolist())) > 2
-
-
-# --- known results -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

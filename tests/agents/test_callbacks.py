@@ -43,9 +43,6 @@ def lake(engine="compiled", n_envs=1, name="qlearning", **kwargs):
     return make(name, environment(LAKE, n_envs, seed=0), seed=0, engine=engine, **kwargs)
 
 
-# --- every callback ------------------------------------------------------------------------------
-
-
 def snapshot(model):
     """What a callback can see of the agent; environments are behind where nobody looks at them."""
     return {key: value for key, value in state_of(model).items() if " of " not in key}
@@ -156,9 +153,6 @@ def test_every_callback_at_the_same_steps(tmp_path):
     assert folders == {"", "steps", "episodes"}
 
 
-# --- when callbacks act --------------------------------------------------------------------------
-
-
 class Sparse(BlockCallback):
     def __init__(self, every, answers=()):
         super().__init__()
@@ -180,9 +174,6 @@ def test_a_sparse_callback_can_stop_the_training():
     callback = Sparse(20)
     DQN("MlpPolicy", "CartPole-v1", learning_starts=1000).learn(70, callback=callback)
     assert callback.seen == [20, 40, 60]
-
-
-# --- logs ----------------------------------------------------------------------------------------
 
 
 def test_a_compiled_training_logs_once_per_block(tmp_path):

@@ -155,9 +155,6 @@ def test_predict_takes_one_observation_or_many_and_arguments_have_names(name):
         make(name, nonsense=1)
 
 
-# --- the library's services ----------------------------------------------------------------------
-
-
 def test_a_loaded_agent_can_go_on_in_an_episode(tmp_path):
     for name in ("sarsa", "monte_carlo", "reinforce"):
         env = environment(LAKE, 2)
@@ -166,9 +163,6 @@ def test_a_loaded_agent_can_go_on_in_an_episode(tmp_path):
         loaded = type(model).load(tmp_path / "model", env, force_reset=False)
         assert loaded._last_obs.tolist() == model._last_obs.tolist()
         assert loaded.learn(50, reset_num_timesteps=False).num_timesteps == 100
-
-
-# --- what files keep -----------------------------------------------------------------------------
 
 
 def test_files_of_other_agents_are_refused(tmp_path):

@@ -104,9 +104,6 @@ def test_the_engine_that_was_asked_for():
     assert (model.engine_in_use, plain.seen) == ("compiled", 10)
 
 
-# --- environments of one's own -------------------------------------------------------------------
-
-
 def played(kind, engine, **settings):
     env = TimeLimit(kind(), 50)
     uniform = {"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0}
@@ -164,9 +161,6 @@ def test_an_observation_outside_of_the_space_is_refused(name):
             model = load_algorithm(name)(env=Liar(*shown), seed=0)
             with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
                 model.learn(5)
-
-
-# --- agents of one's own -------------------------------------------------------------------------
 
 
 class OwnLearning(load_algorithm("qlearning")):

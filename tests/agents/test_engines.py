@@ -155,9 +155,6 @@ def test_schedules_by_episodes():
     assert models[0]._current_progress_remaining == pytest.approx(0.0, abs=0.01)
 
 
-# --- changes in the middle of a training ---------------------------------------------------------
-
-
 class Change(BlockCallback):
     """Does something to the agent on a call."""
 

@@ -71,9 +71,6 @@ def test_expected_value_is_the_mean_under_the_probabilities(values, rate, strate
     np.testing.assert_allclose(found, probabilities, rtol=1e-12, atol=1e-15)
 
 
-# --- what agents would do, row by row -------------------------------------------------------------
-
-
 def agent_of(values, **arguments):
     """A Q-learning agent with a table of values."""
     agent = load_algorithm("qlearning")(env=Spaces(*values.shape), seed=0, **arguments)
@@ -135,8 +132,6 @@ def test_how_much_agents_explore(arguments, rates):
     is_noise = "noise_std" in arguments
     assert model.exploration_rate == pytest.approx(rates[-1] / (4 if is_noise else 1))
 
-
-# --- schedules ------------------------------------------------------------------------------------
 
 # Training may run past its end, by a rollout or an episode.
 progress = st.floats(-0.5, 1)

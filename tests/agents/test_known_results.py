@@ -30,9 +30,6 @@ def made(name, env_id, seed=0, n_envs=1, env_kwargs=None, **settings):
     return load_algorithm(name)(env=env, seed=seed, **settings)
 
 
-# --- planning ------------------------------------------------------------------------------------
-
-
 def test_policy_iteration_by_hand():
     """To stay in state 0 earns 1, in state 1 it earns 3; to go over earns nothing."""
     next_state = np.array([[[0], [1]], [[1], [1]]])
@@ -71,9 +68,6 @@ def test_plans_need_a_model_and_the_optimum_a_time_limit():
         load_algorithm("value_iteration")(env=unknown).learn(1)
     with pytest.raises(ValueError, match="needs a time limit"):
         load_algorithm("optimal")(env=gym.make("CliffWalking-v1")).learn(1)
-
-
-# --- learning ------------------------------------------------------------------------------------
 
 
 def returns_of(name, env_id, seed, n_episodes, env_kwargs=None, **settings):

@@ -20,8 +20,6 @@ from rl_yardstick.agents.library import DeepQLearning, DoubleDQN, double_q_value
 from rl_yardstick.agents.random_search import ARS
 from rl_yardstick.agents.reference import AngleAgent, RandomAgent
 
-# --- deep Q-learning -----------------------------------------------------------------------------
-
 SETTINGS = {"learning_starts": 50, "train_freq": 4, "batch_size": 16, "buffer_size": 500, "seed": 0}
 
 
@@ -75,9 +73,6 @@ def test_where_it_is_dqn_to_the_bit(algorithm, env_id):
     assert th.equal(*weights)
 
 
-# --- augmented random search ---------------------------------------------------------------------
-
-
 class Ended(BaseCallback):
     """How many episodes ended on each call."""
 
@@ -124,8 +119,6 @@ def test_the_search_itself_is_the_librarys():
     assert ours.num_timesteps == theirs.num_timesteps
     assert th.equal(ours.weights, theirs.weights)
 
-
-# --- agents that do not learn --------------------------------------------------------------------
 
 N = 5000
 

@@ -14,8 +14,6 @@ from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.linear.tiles import make_tiles, tiles_of_all
 from tests.agents.hand_fed import Told
 
-# --- tiles ---------------------------------------------------------------------------------------
-
 UNIT = spaces.Box(0.0, 1.0, (2,))
 UNBOUNDED = spaces.Box(np.array([-4.8, -np.inf], "f4"), np.array([4.8, np.inf], "f4"))
 
@@ -71,8 +69,6 @@ def test_settings_that_make_no_tiling(settings, message):
         make_tiles(UNBOUNDED, **settings, n_actions=3)
 
 
-# --- semi-gradient control -----------------------------------------------------------------------
-
 LINE = spaces.Box(0.0, 4.0, (1,))
 HERE, THERE = np.array([0.25], "f4"), np.array([2.25], "f4")
 
@@ -113,9 +109,6 @@ def test_semi_gradient_sarsa_judges_by_the_action_that_it_commits_to():
         assert weights[0, 0] == 2 + 0.5 * weights[1, told.committed]
         chosen.add(told.committed)
     assert chosen == {0, 1}
-
-
-# --- policy gradients ----------------------------------------------------------------------------
 
 
 def softmax(preferences):

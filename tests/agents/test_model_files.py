@@ -31,9 +31,6 @@ def through_json(value):
     return decode(json.loads(json.dumps(encode(value))))
 
 
-# --- arrays, numbers, containers -----------------------------------------------------------------
-
-
 @given(npst.arrays(st.one_of(ARRAY_DTYPES), npst.array_shapes(min_dims=0, min_side=0)))
 def test_arrays_come_back_to_the_last_bit(array):
     back = through_json(array)
@@ -118,9 +115,6 @@ def test_it_comes_back_and_goes_on_where_it_was(name):
         decode({**text, "seed": 1})
 
 
-# --- what has no place in the format -------------------------------------------------------------
-
-
 # A class that only calls itself what the format knows.
 Impostor = type("Discrete", (), {"n": 3, "start": 0, "_np_random": None})
 
@@ -143,8 +137,6 @@ def test_other_types_are_refused_wherever_they_stand(kind):
         with pytest.raises(UnknownTypeError, match="cannot be written as JSON"):
             encode(nested)
 
-
-# --- damaged files -------------------------------------------------------------------------------
 
 json_values = st.recursive(
     plain,

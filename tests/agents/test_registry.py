@@ -117,9 +117,6 @@ def test_an_optional_package_that_is_missing(monkeypatch):
         load_algorithm("qrdqn")
 
 
-# --- agents that are added -----------------------------------------------------------------------
-
-
 MINE = "some_module:Mine"
 
 
@@ -140,8 +137,6 @@ def test_what_cannot_be_registered(name, entry_point, fields, complaint):
     assert complaint in str(caught.value)
     assert before == ALGORITHMS
 
-
-# --- the agents that CONTRIBUTING.md writes, as they stand there ----------------------------------
 
 DOCUMENT = Path(__file__).parents[2] / "CONTRIBUTING.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)

@@ -15,8 +15,6 @@ from tests.agents.hand_fed import Fed
 
 ONE_STEP = ("qlearning", "sarsa", "expected_sarsa", "double_qlearning")
 
-# --- one table of updates -------------------------------------------------------------------------
-
 # Two states, three actions. The transition: state 0, action 1, reward 2, then state 1; gamma is a
 # half, the step size a tenth.
 FIRST_TABLE = [[0.0, 10.0, 0.0], [4.0, 8.0, 6.0]]
@@ -109,9 +107,6 @@ def test_updates_by_hand(row):
         assert fed.committed == (1 if name == "sarsa" else -1)
 
 
-# --- one step ------------------------------------------------------------------------------------
-
-
 def test_sarsa_judges_by_the_action_that_it_commits_to():
     met = set()
     for seed in range(9):
@@ -153,9 +148,6 @@ def test_termination_leaves_the_reward_alone_and_truncation_does_not(name):
         assert changed == (end != "terminated")
 
 
-# --- in an environment ---------------------------------------------------------------------------
-
-
 class Tracer(BaseCallback):
     actions, commitments = (), ()
 
@@ -173,9 +165,6 @@ def test_sarsa_does_what_it_committed_to():
     load_algorithm("sarsa")(env=env, seed=0, **uniform).learn(300, callback=tracer)
     assert tracer.commitments[:-1] == tracer.actions[1:]
     assert set(tracer.actions) == {0, 1}
-
-
-# --- optimism ------------------------------------------------------------------------------------
 
 
 def test_one_update_by_hand():
@@ -204,9 +193,6 @@ def test_tables_begin_where_they_are_told_to():
     # 3000 entries: mean and standard deviation within four standard errors.
     assert drawn.mean() == pytest.approx(5, abs=4 * 2 / 3000**0.5)
     assert drawn.std() == pytest.approx(2, abs=4 * 2 / 6000**0.5)
-
-
-# --- Dyna-Q --------------------------------------------------------------------------------------
 
 
 def test_planning_draws_pairs_and_outcomes_alike():
@@ -242,9 +228,6 @@ def test_much_planning_ends_in_the_optimum(name, settings):
     np.testing.assert_allclose(agent.policy.q_table[tried], expected[tried], atol=1e-12)
 
 
-# --- prioritised sweeping ------------------------------------------------------------------------
-
-
 def test_the_largest_error_comes_first():
     fed = Fed("prioritized_sweeping", np.zeros((8, 1)), planning_steps=0, learning_rate=1.0)
     rewards = [3, -7, 1, 5, 2, -4, 6]
@@ -259,9 +242,6 @@ def test_the_largest_error_comes_first():
         order.append(int(np.flatnonzero(fed.table[:, 0] != before)[0]))
     assert order == [1, 6, 3, 5, 0, 4, 2]
     assert fed.table[:, 0].tolist() == [3, -7, 1, 5, 2, -4, -0.5, 0]
-
-
-# --- R-max ---------------------------------------------------------------------------------------
 
 
 def test_r_max_plans_the_optimum_of_what_it_has_counted():

@@ -25,8 +25,6 @@ from rl_yardstick.agents.compiled.worlds import (
 from rl_yardstick.envs.wrappers import DiscretizeObservation
 from rl_yardstick.machine_code.compiling import kernel
 
-# --- physics -------------------------------------------------------------------------------------
-
 
 @numba.njit
 def swing_each(records, world, terminated):
@@ -142,9 +140,6 @@ def test_bins_equal_the_wrappers(kwargs, dims):
     assert len(np.unique(indices)) > 0.8 * env.observation_space.n
 
 
-# --- Monitor's sums -------------------------------------------------------------------------------
-
-
 @numba.njit
 def running_sums(record, rewards, compensated, sums):
     begin_episode(record)
@@ -176,8 +171,6 @@ def test_sums_by_either_rule_and_as_this_python_does(values):
         running_sums(np.zeros(1, dtype=CART_POLE_ENV)[0], np.array(values), compensated, sums)
         assert sums.tolist() == [add_up(values[: i + 1]) for i in range(len(values))]
 
-
-# --- generators ----------------------------------------------------------------------------------
 
 KINDS = (np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox)
 

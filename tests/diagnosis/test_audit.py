@@ -44,8 +44,6 @@ def of_class(name):
     return subject
 
 
-# --- what is found --------------------------------------------------------------------------------
-
 OF_TABLES = {  # the fault: what has it, what that claims to be, and the probe that sees it
     "bootstraps-at-terminal": (q_learning, "q_learning", target_probes.probe_ends),
     "discount-twice": (q_learning, "q_learning", target_probes.probe_discount),
@@ -127,9 +125,6 @@ def test_faults_of_classes_are_named(name):
 def test_right_classes_pass(name):
     """DQN too where DummyVecEnv keeps no copy of an episode's last observation."""
     assert {found.state for found in audit(of_class(name), [0], RIGHT_CLASSES[name])} == {"ok"}
-
-
-# --- when nothing is said -------------------------------------------------------------------------
 
 
 def restless(make_env, seed, gamma, steps):

@@ -34,9 +34,6 @@ def arms_to_pull(n, n_arms):
     return np.random.default_rng(99).integers(n_arms, size=n).tolist()
 
 
-# --- draws ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("drift_std", [0.0, 0.25])
 @pytest.mark.parametrize("given_means", [None, [0.5, 0.5, 0.5]], ids=["redrawn", "given"])
 def test_draws_of_gaussian_bandits(given_means, drift_std):
@@ -94,9 +91,6 @@ def test_draws_of_linear_bandits(redraws):
         shown, _ = env.reset()
 
 
-# --- what step tells, and when it ends ------------------------------------------------------------
-
-
 def test_each_of_several_best_arms_has_no_regret():
     env = BernoulliBandit([0.1, 0.7, 0.7])
     assert env.reset(seed=0)[1] == {}
@@ -123,9 +117,6 @@ def test_feedback_is_due_at_the_end_of_each_batch_and_of_the_episode():
         assert [i for i in range(12) if due[i]] == [4, 9, 11]
 
 
-# --- known figures --------------------------------------------------------------------------------
-
-
 def test_what_a_pooled_test_of_segments_loses_is_exact():
     env = gym.make("SegmentBandit-v0")
     model, horizon = transition_model(env), time_limit(env)
@@ -150,9 +141,6 @@ def write(tmp_path):
         return path
 
     return written
-
-
-# --- reading logs ---------------------------------------------------------------------------------
 
 
 def test_a_log_with_a_context_of_text():
@@ -221,9 +209,6 @@ def test_mistakes_in_a_log_are_named_with_their_row(tmp_path, text, message):
     assert "\n" not in str(refused.value)
 
 
-# --- writing logs ---------------------------------------------------------------------------------
-
-
 UNIFORM = [  # an environment, its settings, the names of its contexts
     ("SegmentBandit-v0", {"pulls": 30}, ("context",)),
     ("LinearBandit-v0", {}, tuple(f"feature_{i}" for i in range(5))),
@@ -244,9 +229,6 @@ def test_a_uniform_log_holds_what_the_environment_gave(env_id, kwargs, names, tm
         assert data.rewards[i] == reward
         if truncated:
             context, _ = env.reset()
-
-
-# --- replay ---------------------------------------------------------------------------------------
 
 
 def test_replay_by_hand(tmp_path):

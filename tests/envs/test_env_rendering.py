@@ -42,9 +42,6 @@ def count(drawn, colour):
     return int((drawn == colour).all(axis=2).sum())
 
 
-# --- maps as text ---------------------------------------------------------------------------------
-
-
 def test_text_of_a_map():
     env = WarehouseEnv(desc=["..G", ".#.", "S.."], render_mode="ansi")
     assert shown(env, RIGHT, RIGHT, RIGHT) == "(right)\n..G\n.#.\nS*R\n"
@@ -52,9 +49,6 @@ def test_text_of_a_map():
     assert shown(env) == "(start)\n..G\n.#.\nR..\n"
     maze = MineMazeEnv(desc=["SPPM", "...G"], render_mode="ansi")
     assert shown(maze, RIGHT, DOWN) == "(down)\nS*PM\n.R.G\n"
-
-
-# --- maps as pictures -----------------------------------------------------------------------------
 
 
 def test_a_picture_fits_belongs_to_the_caller_and_is_as_before_after_reset():
@@ -106,9 +100,6 @@ def test_a_picture_is_as_it_was(name, tmp_path):
     assert changed.mean() <= SHARE, f"{changed.mean():.2%} of {tmp_path}/{name}.png has changed"
 
 
-# --- windows --------------------------------------------------------------------------------------
-
-
 def test_the_window_shows_the_picture_and_closes():
     env = gym.make("envs:Warehouse-v0", render_mode="human", desc=["S.G"])
     env.reset(seed=0)
@@ -128,9 +119,6 @@ def test_the_window_shows_the_picture_and_closes():
         other.reset()
         assert pygame.display.get_surface() is not None
         other.close()
-
-
-# --- bandits --------------------------------------------------------------------------------------
 
 
 def test_text_of_bandits():

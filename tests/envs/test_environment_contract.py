@@ -136,8 +136,6 @@ def test_p_is_the_model_as_dictionaries(env_id, kwargs):
     assert [type(value) for value in env.P[0][0][0]] == [float, int, float, bool]
 
 
-# --- arguments ------------------------------------------------------------------------------------
-
 MANY = {"segment_probabilities": [1 / 1024] * 1024, "click_rates": [[0.5, 0.5]] * 1024}
 ONE = {"segment_probabilities": [1], "click_rates": [[0.5]]}
 REFUSED = [
@@ -171,9 +169,6 @@ def test_arguments_out_of_range_are_refused(name, wrong, line):
     with pytest.raises(ValueError, match=re.escape(line)) as refused:
         gym.make(f"{name}-v0", **wrong)
     assert "\n" not in str(refused.value)
-
-
-# --- wrappers, worked by hand ---------------------------------------------------------------------
 
 
 class Showing(gym.Env):
@@ -295,9 +290,6 @@ def test_wrapped_environments_are_checked_remade_from_their_spec_and_pickled(nam
         assert str(other) == str(env)
         assert_equal(env.reset(seed=3), other.reset(seed=3))
         assert_equal(play(env, 50, seed=0), play(other, 50, seed=0))
-
-
-# --- action masks ---------------------------------------------------------------------------------
 
 
 def test_moves_that_bump_and_actions_that_are_idle_are_masked():

@@ -192,8 +192,6 @@ def test_the_transitions_that_count_as_success(name):
     assert [(state, action) for state, action, _ in found] == SUCCESSES[name]
 
 
-# --- states on a map ------------------------------------------------------------------------------
-
 UP, DOWN, LEFT, RIGHT = (-1, 0), (1, 0), (0, -1), (0, 1)
 LAYOUTS = {
     "Warehouse": ("...#.....G", {"#": "shelf"}, (UP, DOWN, LEFT, RIGHT)),
@@ -248,8 +246,6 @@ def test_layers_other_layouts_and_names():
     assert state_name(taxi, None, state) == "row 1, column 4, passenger on board, to G"
     assert state_name(gym.make("RiverSwim-v0"), None, 3) == "state 3"
 
-
-# --- brackets of optima: claimed for what they were worked out for alone --------------------------
 
 DOCUMENT = Path(train.__file__).parent / "docs" / "continuous.md"
 ENTRIES = {entry["id"]: entry for limits in known_entries().values() for entry in limits.values()}

@@ -31,9 +31,6 @@ def few_steps(monkeypatch):
     monkeypatch.setattr(checking, "N_STEPS", FEW)
 
 
-# --- right models ---------------------------------------------------------------------------------
-
-
 class Careless(Corridor):
     """Draws from the generators that all code shares."""
 
@@ -59,9 +56,6 @@ def test_right_models_are_believed(name):
     assert check.refusal is None
     assert check.n_steps > 0.9 * FEW
     assert (check.bit_for_bit, check.state_can_be_set) == (bit_for_bit, state_can_be_set)
-
-
-# --- false models ---------------------------------------------------------------------------------
 
 
 class Odd(Corridor):
@@ -157,9 +151,6 @@ def test_a_known_class_that_was_changed_is_not_believed_unless_it_does_the_same(
     ours, known = (transition_model(env) for env in (Same(), FrozenLakeEnv()))
     np.testing.assert_array_equal(ours.prob, known.prob)
     assert transition_model(type("Plain", (WarehouseEnv,), {})(slip=0.1)) is not None
-
-
-# --- the check itself -----------------------------------------------------------------------------
 
 
 def test_the_caller_notices_nothing():

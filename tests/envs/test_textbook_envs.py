@@ -47,9 +47,6 @@ def walk(env, actions):
     return [step[3] for step in steps], [step[1] for step in steps], steps[-1][2]
 
 
-# --- RandomWalk and ShortCorridor -----------------------------------------------------------------
-
-
 def test_values_of_short_walks_are_those_of_the_book():
     # Examples 6.2 and 7.1.
     values = optimal_values("RandomWalk-v0")
@@ -67,9 +64,6 @@ def test_the_second_state_of_the_corridor_alone_is_reversed():
     states = [0, 1, 0, 1, 2, 1, 0, 0, 1]
     assert walk(env, [0, 1, 1, 1, 0, 0, 1, 0, 1]) == (states, [-1.0] * 9, False)
     assert walk(env, [0, 1])[1:] == ([-1.0, -1.0], True)
-
-
-# --- WindyGridworld -------------------------------------------------------------------------------
 
 
 def next_by_hand(state, down, right, gust):
@@ -95,9 +89,6 @@ def test_the_shortest_ways_and_every_step_in_the_wind():
                 by_hand[next_by_hand(state, *move, gust)] += 1 / 3
             np.testing.assert_allclose(chances, by_hand, atol=1e-15)
     assert (model.reward[np.arange(70) != 37] == -1).all()
-
-
-# --- GamblersProblem, MaximizationBias, RiverSwim and DeepSea -------------------------------------
 
 
 def test_values_of_the_gambler_are_those_of_bold_play():
@@ -169,8 +160,6 @@ def test_the_treasure_is_worth_99_hundredths(size, map_seed):
     assert model.prob[0, right].tolist() == [1 - 1 / size, 1 / size]
 
 
-# --- Racetrack ------------------------------------------------------------------------------------
-
 COAST, FASTER_UP, SLOWER_UP, FASTER_RIGHT, SLOWER_RIGHT = 4, 7, 1, 5, 3
 
 
@@ -226,8 +215,6 @@ def test_without_noise_the_race_takes_ten_steps_and_more():
     assert optimum_of("Racetrack-v0", noise=0) == pytest.approx(-52 / 5)
 
 
-# --- JacksCarRental -------------------------------------------------------------------------------
-
 N = 21
 
 
@@ -264,9 +251,6 @@ def test_optimal_values_and_policy_are_those_of_figure_4_2():
     assert env.render().startswith("moved +2\n")
 
 
-# --- what they share ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "state", "action"),
     [
@@ -292,8 +276,6 @@ def test_drawn_rewards_have_the_models_mean_and_variance(env_id, kwargs, state, 
     np.add.at(chances, model.next_state[state, action], prob)
     assert (np.abs(counts - n * chances) <= 5 * np.sqrt(n * chances) + 3).all()
 
-
-# --- Blackjack ------------------------------------------------------------------------------------
 
 SUTTON, NATURAL = {"sab": True}, {"sab": False, "natural": True}
 PUBLISHED = [(SUTTON, -0.0431), (NATURAL, -0.0257), ({"sab": False, "natural": False}, -0.0466)]
@@ -351,9 +333,6 @@ def test_another_blackjack_is_not_believed_and_none_is_compiled():
         compile_envs(agent.env)
 
 
-# --- what they hide: Tiger ------------------------------------------------------------------------
-
-
 def chances(env_id, state, action, **kwargs):
     """What may come of an action: the chance of each state, by its number."""
     model = transition_model(gym.make(env_id, **kwargs))
@@ -383,8 +362,6 @@ def test_the_tiger_is_heard_where_it_is_with_the_accuracy():
     np.testing.assert_allclose(model.expected_reward, rewards)
     assert finite_horizon_optimum(model, time_limit(env)).start_value == pytest.approx(100)
 
-
-# --- Hallway --------------------------------------------------------------------------------------
 
 NORTH, EAST, SOUTH, WEST = range(4)
 STAY, FORWARD, RIGHT, AROUND, LEFT = range(5)
@@ -461,9 +438,6 @@ def test_readings_are_those_of_the_original():
     ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]
     assert set(model.reward[ends]) == {1.0}
     assert model.reward[~ends & (model.prob > 0) & model.reachable[:, None, None]].max() == 0
-
-
-# --- DarkWarehouse --------------------------------------------------------------------------------
 
 
 def test_the_dark_shows_the_four_cells_beside():

@@ -122,8 +122,6 @@ def test_wrong_policies_are_refused(policy, horizon, message):
             function(coin(0.5), np.array(policy), horizon)
 
 
-# --- values of states, with the whole time limit ahead -------------------------------------------
-
 LEFT, RIGHT = 0, 1
 
 
@@ -157,9 +155,6 @@ def test_actions_are_equal_within_rounding(worth, advantage, n_best):
     assert optimal_choices(model, 3)[1].sum() == n_best
 
 
-# --- a time limit ---------------------------------------------------------------------------------
-
-
 def test_a_way_that_goes_round_for_a_million_steps():
     """0 leads to 1, and 1 and 2 to each other, for 1, 2 and 3; seven steps are 1 + 3 (2 + 3)."""
     model = deterministic([[1], [2], [1]], [[1], [2], [3]], [[False]] * 3)
@@ -167,9 +162,6 @@ def test_a_way_that_goes_round_for_a_million_steps():
     assert policy_return(model, policy, 7).expected_return == 16
     assert policy_return(model, policy, 10**6 + 1).expected_return == 1 + 5 * 10**6 / 2
     assert policy_return(model, policy, 10**6 + 1).expected_length == 10**6 + 1
-
-
-# --- a limit far away ----------------------------------------------------------------------------
 
 
 def far_goal(end=-50.0, step=-1.0, ends=True):

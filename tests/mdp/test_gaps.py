@@ -127,9 +127,6 @@ def test_the_gradient_of_a_policy_is_that_of_its_return(drawn):
     assert (nearby - value) / step == pytest.approx((slope * toward).sum(), abs=1e-3 * scale)
 
 
-# --- what advantage estimation expects ------------------------------------------------------------
-
-
 def chain():
     """Two states: 0 goes on (rewards 1 and 2, then the end), 1 stays for nothing."""
     return deterministic([[1, 0], [1, 1]], [[1, 0], [2, 0]], [[False, False], [True, False]])

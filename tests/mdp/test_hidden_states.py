@@ -97,9 +97,6 @@ def test_values_of_the_tiger_are_those_worked_out_by_hand(accuracy, horizon, val
     assert found.lower == found.upper == pytest.approx(value, abs=1e-12)
 
 
-# --- by the present observation alone -------------------------------------------------------------
-
-
 def test_the_best_in_the_short_corridor_is_random_and_proved():
     """Sutton and Barto, example 13.1: right with probability 2 - sqrt(2)."""
     model, groups = hidden_of("ShortCorridor-v0")

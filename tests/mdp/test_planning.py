@@ -28,8 +28,6 @@ def model_of(env_id, **kwargs):
     return transition_model(gym.make(f"envs:{env_id}", **kwargs))
 
 
-# --- known optima ---------------------------------------------------------------------------------
-
 OPTIMA = [
     ("Warehouse-v0", {}, 1.0, 79.0, 1e-9),
     ("Warehouse-v0", {}, 0.5, -1.99995, 5e-6),
@@ -81,8 +79,6 @@ def test_sweeps_that_contract_slowly_are_helped_out():
     gap = two.action_values.max(axis=1) - two.action_values[np.arange(len(one.policy)), one.policy]
     assert gap[model.reachable].max() <= 4 * bound
 
-
-# --- problems worked by hand ----------------------------------------------------------------------
 
 INF = np.inf
 BY_HAND = {  # next states, rewards, ends; the best values of actions, and the policy
@@ -145,9 +141,6 @@ def test_what_is_best_depends_on_the_steps_left():
         assert [found.actions(step)[0] for step in range(horizon)] == first_actions
 
 
-# --- among the actions that a mask allows ---------------------------------------------------------
-
-
 @settings(max_examples=40)
 @given(models(), st.data())
 def test_a_mask_leaves_the_model_without_the_actions_that_it_forbids(model, data):
@@ -171,9 +164,6 @@ def test_a_mask_leaves_the_model_without_the_actions_that_it_forbids(model, data
             assert (np.isneginf(found.action_values) == ~mask)[live].all()
 
 
-# --- refusals -------------------------------------------------------------------------------------
-
-
 def test_masks_that_leave_no_way_are_refused():
     # Action 0 ends the episode, action 1 stays at a cost.
     model = deterministic([[0, 0]], [[5, -1]], [[True, False]])
@@ -183,9 +173,6 @@ def test_masks_that_leave_no_way_are_refused():
     for plan in (value_iteration, policy_iteration, finite_horizon_optimum):
         with pytest.raises(ValueError, match=r"^the mask allows nothing in state 0$"):
             plan(model, 1, mask=np.zeros((1, 2), bool))
-
-
-# --- the transition model -------------------------------------------------------------------------
 
 
 def arrays():

@@ -25,9 +25,6 @@ def ends(found):
     return found.low, found.high
 
 
-# --- figures over runs ----------------------------------------------------------------------------
-
-
 def test_a_mean_has_students_interval_cut_at_what_is_possible():
     runs = np.array([3.0, 5, 4, 8, 6])
     found = mean_over_runs([*runs, NAN])
@@ -94,9 +91,6 @@ def test_intervals_over_normal_runs_cover(n):
     assert np.mean([low <= 3 <= high for low, high in found]) == pytest.approx(0.95, abs=0.02)
 
 
-# --- one curve ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("values", "threshold", "first", "to_stay"),
     [
@@ -124,9 +118,6 @@ def test_curves_that_are_none_are_refused():
         on_grid([0, 1], [0, 0, 0], [0])
     with pytest.raises(ValueError, match="shape"):
         steps_to_threshold([], [], 1)
-
-
-# --- several curves -------------------------------------------------------------------------------
 
 
 def test_the_shared_grid_is_where_all_curves_are():

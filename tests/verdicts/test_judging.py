@@ -30,9 +30,6 @@ def drawn(seed, n, *means, spread=0.1):
     return {f"a{k}": rng.normal(mean, spread, n) for k, mean in enumerate(means)}
 
 
-# --- the tests ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("n", [(8, 8), (6, 20)])
 def test_differences_are_welchs_and_ties_are_two_one_sided_tests(n):
     x, y = (np.random.default_rng(k).normal(0.5 + 0.05 * k, 0.1 + 0.1 * k, n[k]) for k in (0, 1))
@@ -95,9 +92,6 @@ def test_an_agent_without_chance_is_known():
     both = judge({"w": {"plan": [1.0], "same": [0.99]}}, certain={("w", "plan"), ("w", "same")})
     assert (only(both).word, only(both).p_tied) == ("tied", 0.0)
     assert only(both).interval == pytest.approx((0.01, 0.01))
-
-
-# --- the words ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -195,9 +189,6 @@ def test_so_many_seeds_as_are_said_to_be_needed_decide():
     assert (word_with(needed), word_with(int(needed * 0.95))) == (word, "undecided")
 
 
-# --- agents ---------------------------------------------------------------------------------------
-
-
 def test_the_figures_of_an_agent():
     runs = [1.0, 0.9, 0.2, 0.95, 1.0, NAN]
     study = judge({"w": {"x": runs, "y": [0.8] * 6}}, bounds=(0, 1))
@@ -231,9 +222,6 @@ def test_arguments_out_of_range_are_named():
     for wrong in ({"level": 0.5}, {"level": 0.0}, {"n_looks": 0}, {"margin": -0.1}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             judge({"w": {"x": [1.0]}}, **wrong)
-
-
-# --- growing studies ------------------------------------------------------------------------------
 
 
 def test_looks_share_the_level_and_decided_pairs_keep_their_word():

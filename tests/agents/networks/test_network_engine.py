@@ -68,8 +68,6 @@ def made(name, env, policy="MlpPolicy", **kwargs):
     return load_algorithm(name)(policy, env, device="cpu", seed=0, **kwargs)
 
 
-# --- which engine --------------------------------------------------------------------------------
-
 LONG, FEW = 200_000, 2_000
 TOO_SHORT = "library: so short a training is not worth compiling"
 BRIDGED = "compiled but for the environment: "
@@ -97,9 +95,6 @@ def test_which_engine_trains(case):
     name, settings, env, callback, budget, chosen = PLANS[case]
     model = made(name, env(), **settings)
     assert str(model.engine_plan(budget, callback and callback())) == chosen
-
-
-# --- what is refused -----------------------------------------------------------------------------
 
 
 class OwnDQN(load_algorithm("dqn")):
@@ -166,8 +161,6 @@ def test_a_training_that_diverges_is_ended():
     model = made("dqn", env, engine="compiled", **SMALL).learn(100)
     assert all(bool(p.isnan().all()) for p in model.q_net.parameters())
 
-
-# --- files ---------------------------------------------------------------------------------------
 
 Q = {"learning_starts": 50, "buffer_size": 400, "target_update_interval": 20}
 FALLING = library_schedule(ExponentialSchedule(0.001, 0.0001))

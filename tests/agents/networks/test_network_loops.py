@@ -322,8 +322,6 @@ def of_rollouts(record):
     return {key: value for key, value in record.items() if key.startswith("rollout/")}
 
 
-# --- stops ---------------------------------------------------------------------------
-
 MODES = ("parts", "compiled")
 
 
