@@ -21,15 +21,13 @@ from stable_baselines3.common.logger import configure
 
 from rl_yardstick.agents.common.callbacks import (
     BlockCallback,
-    Horizon,
-    calls_until_multiple,
     members,
 )
 from rl_yardstick.pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.run import Run
 from rl_yardstick.pipeline.spec import TrainSpec
-from tests.agents.trainings import LAKE, environment, make, state_of
+from tests.agents.trainings import LAKE, Every, environment, make, state_of
 
 ENGINES = ("interpreted", "compiled")
 OF_THE_CLOCK = {"time/fps", "time/time_elapsed"}
@@ -67,23 +65,7 @@ class Recorder(BaseCallback):
         return True
 
 
-class Watcher(BlockCallback):
-    """Acts on every fortieth call."""
-
-    def __init__(self):
-        super().__init__()
-        self.seen = []
-
-    def horizon(self):
-        return Horizon(calls=calls_until_multiple(self.n_calls, 40))
-
-    def _on_step(self):
-        if self.n_calls % 40 == 0:
-            self.seen.append((self.num_timesteps, self.locals["new_obs"].tolist()))
-        return True
-
-
-def every_kind(folder, evaluated):
+def every_kind(folder, evaluated, watched):
     """One callback of every kind that the compiled engine knows."""
     env = environment(LAKE, 1, seed=9)
 
@@ -104,7 +86,12 @@ def every_kind(folder, evaluated):
         StepCheckpoint(steps, 85),
         EpisodeCheckpoint(episodes, 9),
         ProgressBarCallback(),
-        CallbackList([Watcher(), StopTrainingOnMaxEpisodes(60)]),
+        CallbackList(
+            [
+                Every(40, lambda model: watched.append(snapshot(model))),
+                StopTrainingOnMaxEpisodes(60),
+            ]
+        ),
     ]
 
 
@@ -120,8 +107,8 @@ def saved(path):
 
 def trained(engine, folder):
     """Everything that happened in a training with all callbacks."""
-    model, evaluated = lake(engine, 3, "sarsa", exploration_final_eps=0.3), []
-    callbacks = every_kind(folder, evaluated)
+    model, evaluated, watched = lake(engine, 3, "sarsa", exploration_final_eps=0.3), [], []
+    callbacks = every_kind(folder, evaluated, watched)
     model.learn(2000, callback=callbacks, log_interval=11)
     assert model.engine_in_use.startswith(engine)
     evaluations = np.load(folder / "evaluations.npz")
@@ -129,7 +116,7 @@ def trained(engine, folder):
     return {
         "evaluated": evaluated,
         "recorded": callbacks[2].callback.seen,
-        "watched": callbacks[-1].callbacks[0].seen,
+        "watched": watched,
         "evaluations": evaluations["timesteps"].tolist(),
         "results": evaluations["results"].tolist(),
         "files": {str(p.relative_to(folder)): saved(p) for p in folder.rglob("*_steps.zip")},

@@ -4,6 +4,13 @@ from functools import partial
 
 import numpy as np
 import pytest
+from tests.diagnosis.planted_tables import (
+    from_memory,
+    number,
+    one_step,
+    preferences,
+    several_steps,
+)
 
 from rl_yardstick.diagnosis import agent_probes, target_probes
 from rl_yardstick.diagnosis.audit import Verdict, audit
@@ -12,13 +19,6 @@ from rl_yardstick.diagnosis.probe_worlds import Record, World
 from rl_yardstick.diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, register_class
 from rl_yardstick.diagnosis.target_probes import watkins_table
 from tests.diagnosis import planted_classes
-from tests.diagnosis.planted_tables import (
-    from_memory,
-    number,
-    one_step,
-    preferences,
-    several_steps,
-)
 
 q_learning, sarsa = partial(one_step, target="max"), partial(one_step, target="next")
 
