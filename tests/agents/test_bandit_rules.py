@@ -14,14 +14,9 @@ from stable_baselines3.common.monitor import Monitor
 
 import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.bandits import upper_bounds
 from rl_yardstick.agents.bandits.algorithm import Pull
 from rl_yardstick.agents.bandits.runs import run_batch, run_one_by_one
-from rl_yardstick.agents.bandits.upper_bounds import (
-    bernoulli_kl,
-    kl_ucb_index,
-    kl_upper_bound,
-    ucb_index,
-)
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from tests.agents.hand_fed import Spaces
 
@@ -92,7 +87,7 @@ INDICES = [  # after 6 pulls: UCB1 takes 2 ln 6, Sutton and Barto the logarithm 
 def test_ucb_index(kwargs, indices):
     model = agent("ucb", **kwargs)
     own = model.width, model.is_textbook
-    values = [ucb_index(0.5, 4, 6, *own), ucb_index(1.0, 1, 6, *own)]
+    values = [upper_bounds.ucb_index(0.5, 4, 6, *own), upper_bounds.ucb_index(1.0, 1, 6, *own)]
     assert values[: len(indices)] == pytest.approx(indices, rel=1e-15)
 
 
@@ -108,24 +103,26 @@ def test_arms_not_tried_come_first(name):
 
 @given(st.floats(0.0, 0.999), st.integers(1, 10_000), st.integers(2, 10**6))
 def test_kl_ucb_index_solves_its_equation(mean, count, pulls):
-    index = kl_ucb_index(mean, count, pulls, 0.0)
+    index = upper_bounds.kl_ucb_index(mean, count, pulls, 0.0)
     assert mean <= index < 1.0
     budget = math.log(pulls) / count
     if index < 1 - 1e-9:
-        assert bernoulli_kl(mean, index) == pytest.approx(budget, rel=1e-5, abs=1e-9)
+        assert upper_bounds.bernoulli_kl(mean, index) == pytest.approx(budget, rel=1e-5, abs=1e-9)
     else:
         # So near to 1, the next number on is already too high, or is 1.
-        assert bernoulli_kl(mean, 1 - 1e-9) <= budget
+        assert upper_bounds.bernoulli_kl(mean, 1 - 1e-9) <= budget
 
 
 def test_kl_ucb_where_it_has_a_closed_form():
     for budget in (1e-6, 0.1, 1.0, 5.0):
-        assert kl_upper_bound(0.0, budget) == pytest.approx(1 - math.exp(-budget), rel=1e-12)
-        assert kl_upper_bound(1.0, budget) == 1.0
-    assert kl_upper_bound(0.3, 0.0) == 0.3
-    with_c = kl_ucb_index(0.3, 10, 100, 3.0)
+        assert upper_bounds.kl_upper_bound(0.0, budget) == pytest.approx(
+            1 - math.exp(-budget), rel=1e-12
+        )
+        assert upper_bounds.kl_upper_bound(1.0, budget) == 1.0
+    assert upper_bounds.kl_upper_bound(0.3, 0.0) == 0.3
+    with_c = upper_bounds.kl_ucb_index(0.3, 10, 100, 3.0)
     budget = (math.log(100) + 3 * math.log(math.log(100))) / 10
-    assert with_c == pytest.approx(kl_upper_bound(0.3, budget), rel=1e-15)
+    assert with_c == pytest.approx(upper_bounds.kl_upper_bound(0.3, budget), rel=1e-15)
 
 
 def test_gradient_step_by_hand():

@@ -7,22 +7,10 @@ import zipfile
 import numpy as np
 import pytest
 from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-    CallbackList,
-    CheckpointCallback,
-    EvalCallback,
-    EveryNTimesteps,
-    LogEveryNTimesteps,
-    ProgressBarCallback,
-    StopTrainingOnMaxEpisodes,
-)
+from stable_baselines3.common import callbacks as sb3
 from stable_baselines3.common.logger import configure
 
-from rl_yardstick.agents.common.callbacks import (
-    BlockCallback,
-    members,
-)
+from rl_yardstick.agents.common.callbacks import BlockCallback, members
 from rl_yardstick.pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.run import Run
@@ -46,7 +34,7 @@ def snapshot(model):
     return {key: value for key, value in state_of(model).items() if " of " not in key}
 
 
-class Recorder(BaseCallback):
+class Recorder(sb3.BaseCallback):
     """Notes what it sees whenever the callback that it is part of acts."""
 
     def __init__(self):
@@ -78,18 +66,18 @@ def every_kind(folder, evaluated, watched):
         for name in ("logs", "steps", "episodes")
     )
     return [
-        EvalCallback(env, eval_freq=90, n_eval_episodes=2, log_path=str(folder), verbose=0),
-        CheckpointCallback(110, str(folder), name_prefix="library"),
-        EveryNTimesteps(70, Recorder()),
-        LogEveryNTimesteps(130),
+        sb3.EvalCallback(env, eval_freq=90, n_eval_episodes=2, log_path=str(folder), verbose=0),
+        sb3.CheckpointCallback(110, str(folder), name_prefix="library"),
+        sb3.EveryNTimesteps(70, Recorder()),
+        sb3.LogEveryNTimesteps(130),
         EvaluationCallback(run, env, evaluator, (55, 0)),
         StepCheckpoint(steps, 85),
         EpisodeCheckpoint(episodes, 9),
-        ProgressBarCallback(),
-        CallbackList(
+        sb3.ProgressBarCallback(),
+        sb3.CallbackList(
             [
                 Every(40, lambda model: watched.append(snapshot(model))),
-                StopTrainingOnMaxEpisodes(60),
+                sb3.StopTrainingOnMaxEpisodes(60),
             ]
         ),
     ]

@@ -21,44 +21,24 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
-from rl_yardstick.agents.common.callbacks import (
-    EpisodeBudget,
-)
+from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.envs import checking as model_checks
+from rl_yardstick.envs import wrappers
 from rl_yardstick.envs.grid import Tile
 from rl_yardstick.envs.known_models import transition_model
-from rl_yardstick.envs.wrappers import (
-    ActionMasks,
-    DiscretizeObservation,
-    FlattenToDiscrete,
-    ScaleReward,
-    TerminationReward,
-)
-from tests.agents.trainings import (
-    AGENTS,
-    CONSTANT,
-    LAKE,
-    LESS,
-    NOISE,
-    Every,
-    Plain,
-    assert_same,
-    environment,
-    make,
-    state_of,
-)
+from tests.agents import trainings
 from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 
 ENGINES = ("interpreted", "compiled")
 HOUSE, SLIPPERY = "Warehouse-v0", {"slip": 0.2, "random_start": True}
 IN_BINS = partial(
-    DiscretizeObservation, bins=50, low=[-0.42, -0.87], high=[0.42, 0.87], dims=[2, 3]
+    wrappers.DiscretizeObservation, bins=50, low=[-0.42, -0.87], high=[0.42, 0.87], dims=[2, 3]
 )
 SWING = {"low": [-2.4, -3, -0.21, -3], "high": [2.4, 3, 0.21, 3], "n_tiles": [2, 3, 6, 6]}
 KING = {"moves": "king", "stochastic": True, "max_episode_steps": 99}
 WORLDS = {
     "house": (HOUSE, SLIPPERY),
-    "lake": (LAKE, {}),
+    "lake": (trainings.LAKE, {}),
     "Taxi": ("Taxi-v4", {}),
     "cliff": ("CliffWalking-v1", {}),
     "gambler": ("GamblersProblem-v0", {"goal": 20}),
@@ -70,7 +50,7 @@ TILED = [name for name, entry in ALGORITHMS.items() if entry.family == "linear"]
 
 
 def both_shaped(env):
-    return TerminationReward(ClipReward(ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
+    return wrappers.TerminationReward(ClipReward(wrappers.ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
 
 
 def rows():
@@ -78,24 +58,30 @@ def rows():
     numbers, places = itertools.cycle((1, 3, 8)), itertools.cycle(WORLDS)
     for name in TABULAR:
         place = next(places)
-        yield f"{name} {place}", name, WORLDS[place], next(numbers), AGENTS[name][1]
+        yield f"{name} {place}", name, WORLDS[place], next(numbers), trainings.AGENTS[name][1]
     for name in TILED:
-        env_id, settings = AGENTS[name]
+        env_id, settings = trainings.AGENTS[name]
         yield f"{name} {env_id}", name, (env_id, {}), 2, settings
-    for wrapper in (both_shaped, FlattenToDiscrete):
+    for wrapper in (both_shaped, wrappers.FlattenToDiscrete):
         slippery = HOUSE, {**SLIPPERY, "wrapper": wrapper}
         yield f"under {wrapper.__name__}", "sarsa", slippery, 2, {"learning_rate": 0.3}
-    yield "bins of CartPole", "qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, LESS
-    yield "tiles of CartPole", "semi_gradient_q", ("CartPole-v1", {}), 1, {**SWING, **LESS}
+    yield "bins of CartPole", "qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, trainings.LESS
+    yield (
+        "tiles of CartPole",
+        "semi_gradient_q",
+        ("CartPole-v1", {}),
+        1,
+        {**SWING, **trainings.LESS},
+    )
     # Episodes of 82 steps, more than there is room for at first.
     left_at_first = {"initial_preferences": [1.47, -1.47], "learning_rate": 0.002}
     yield "reinforce", "reinforce", ("ShortCorridor-v0", {}), 2, left_at_first
     # That all agents keep to masks is seen in test_masks.py, where steps are interpreted.
     masked = {"mask_actions": True}
     tiny = HOUSE, {"desc": ["S.", "#G"], "max_episode_steps": 5}
-    noise = {**masked, **NOISE, "initial_q_std": 5.0}
+    noise = {**masked, **trainings.NOISE, "initial_q_std": 5.0}
     yield "noise masked", "sarsa", tiny, 1, noise
-    yield "masked", "dyna_q_plus", ("Taxi-v4", {"wrapper": ActionMasks}), 2, masked
+    yield "masked", "dyna_q_plus", ("Taxi-v4", {"wrapper": wrappers.ActionMasks}), 2, masked
 
 
 ROWS = {row[0]: row[1:] for row in rows()}
@@ -103,7 +89,9 @@ ROWS = {row[0]: row[1:] for row in rows()}
 
 def in_world(name, place, n_envs=1, folder=None, **settings):
     env_id, kwargs = place
-    return make(name, environment(env_id, n_envs, folder=folder, **kwargs), **settings)
+    return trainings.make(
+        name, trainings.environment(env_id, n_envs, folder=folder, **kwargs), **settings
+    )
 
 
 def assert_engines_agree(make_model, train):
@@ -113,7 +101,7 @@ def assert_engines_agree(make_model, train):
         models.append(make_model(engine=engine))
         train(models[-1])
         assert models[-1].engine_in_use.startswith(engine)
-    assert_same(*map(state_of, models))
+    trainings.assert_same(*map(trainings.state_of, models))
     return models
 
 
@@ -131,8 +119,8 @@ def test_same_bits_also_where_engines_take_turns(row, tmp_path):
         model.env.close()
         lines = [path.read_text().splitlines()[1:] for path in sorted(folder.glob("*.csv"))]
         written = [[line.split(",")[:2] for line in each] for each in lines]
-        states.append({**state_of(model), "rows": written})
-    assert_same(*states)
+        states.append({**trainings.state_of(model), "rows": written})
+    trainings.assert_same(*states)
     assert states[0]["rows"][0][0] == ["r", "l"]
     table = getattr(model.policy, "q_tables", None)
     changed = model.policy.weights if table is None else model.policy.visit_counts
@@ -191,8 +179,11 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", CHANGES)
 def test_a_change_counts_in_both_loops(what):
-    start = {"initial_q": 0.5 * what.startswith("zeros"), **CONSTANT}
-    lake, change = partial(in_world, "sarsa", WORLDS["lake"], **start), Every(501, CHANGES[what])
+    start = {"initial_q": 0.5 * what.startswith("zeros"), **trainings.CONSTANT}
+    lake, change = (
+        partial(in_world, "sarsa", WORLDS["lake"], **start),
+        trainings.Every(501, CHANGES[what]),
+    )
     models = assert_engines_agree(lake, lambda m: m.learn(1000, callback=copy.copy(change)))
     unchanged = lake().learn(1000)
     assert not np.array_equal(models[0].policy.q_tables, unchanged.policy.q_tables)
@@ -246,7 +237,9 @@ def lake(**kwargs):
 
 
 def pole(wrapper=lambda env: env, **kwargs):
-    return DiscretizeObservation(wrapper(gym.make("CartPole-v1", **kwargs)), bins=4, low=-1, high=1)
+    return wrappers.DiscretizeObservation(
+        wrapper(gym.make("CartPole-v1", **kwargs)), bins=4, low=-1, high=1
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -277,7 +270,7 @@ INTERPRETED = {  # reason: environment, settings, callback
     "schedule is a Python function": (lake, {"learning_rate": lambda progress: 0.1 * progress}),
     "ConvertCallback must be asked after each step": (lake, {}, lambda: lambda local, _: True),
     "Plain must be asked after each step$": (
-        lake, {}, lambda: [CallbackList([Plain()]), StopTrainingOnMaxEpisodes(5)]),
+        lake, {}, lambda: [CallbackList([trainings.Plain()]), StopTrainingOnMaxEpisodes(5)]),
 }  # fmt: skip
 
 
@@ -302,7 +295,7 @@ def test_the_engine_that_was_asked_for():
         model.engine = engine
         in_use.append(model.learn(10).engine_in_use)
     assert in_use == ["interpreted: asked for", "compiled", "compiled"]
-    plain = Plain()
+    plain = trainings.Plain()
     model.learn(1_000, callback=EveryNTimesteps(100, plain))
     assert (model.engine_in_use, plain.seen) == ("compiled", 10)
 

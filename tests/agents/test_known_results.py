@@ -11,16 +11,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick import mdp
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.envs.known_models import time_limit, transition_model
-from rl_yardstick.mdp import (
-    TransitionModel,
-    finite_horizon_optimum,
-    policy_iteration,
-    policy_return,
-    value_iteration,
-)
 
 N_SEEDS = 10
 
@@ -33,14 +27,14 @@ def made(name, env_id, seed=0, n_envs=1, env_kwargs=None, **settings):
 def test_policy_iteration_by_hand():
     """To stay in state 0 earns 1, in state 1 it earns 3; to go over earns nothing."""
     next_state = np.array([[[0], [1]], [[1], [1]]])
-    model = TransitionModel(
+    model = mdp.TransitionModel(
         prob=np.ones(next_state.shape),
         next_state=next_state,
         reward=np.array([[[1.0], [0.0]], [[3.0], [3.0]]]),
         terminated=np.zeros(next_state.shape, dtype=bool),
         initial=np.array([1.0, 0.0]),
     )
-    plan = policy_iteration(model, 0.5)
+    plan = mdp.policy_iteration(model, 0.5)
     assert plan.values == pytest.approx([3, 6])
     assert plan.action_values[0] == pytest.approx([2.5, 3])
     assert (plan.policy[0], plan.iterations) == (1, 2)
@@ -48,7 +42,7 @@ def test_policy_iteration_by_hand():
 
 def test_the_optimal_agent_keeps_the_time_of_each_episode_apart():
     agent = made("optimal", "FrozenLake-v1").learn(1)
-    plan = finite_horizon_optimum(transition_model(gym.make("FrozenLake-v1")), 100)
+    plan = mdp.finite_horizon_optimum(transition_model(gym.make("FrozenLake-v1")), 100)
     # A state whose best action changes towards the end of the time.
     changing = np.flatnonzero((plan.policy != plan.policy[0]).any(axis=0))[0]
     state = None
@@ -82,8 +76,8 @@ def worth(agent, env_id, kwargs, horizon=None):
     env = gym.make(env_id, **kwargs)
     model, horizon = transition_model(env), horizon or time_limit(env)
     policy = agent.predict(np.arange(model.n_states), deterministic=True)[0]
-    optimum = finite_horizon_optimum(model, horizon).start_value
-    return policy_return(model, policy, horizon).expected_return, optimum
+    optimum = mdp.finite_horizon_optimum(model, horizon).start_value
+    return mdp.policy_return(model, policy, horizon).expected_return, optimum
 
 
 def test_cliff_walking_as_in_the_book():
@@ -147,9 +141,11 @@ def test_one_try_is_enough_where_nothing_is_random(env_id):
     best; an episode that meets nothing new is therefore as good as the best one.
     """
     model = transition_model(gym.make(env_id))
-    plan = value_iteration(model, 0.99)
+    plan = mdp.value_iteration(model, 0.99)
     bound = max(float(plan.values[model.reachable].max()), 0.0)
     agent = made("r_max", env_id, known_after=1, value_bound=bound, tolerance=1e-9)
     agent.learn(int(model.reachable.sum()) * model.n_actions * 20)
     greedy = np.eye(model.n_actions, dtype=bool)[agent.policy.q_table.argmax(axis=1)]
-    assert value_iteration(model, 0.99, mask=greedy).start_value == pytest.approx(plan.start_value)
+    assert mdp.value_iteration(model, 0.99, mask=greedy).start_value == pytest.approx(
+        plan.start_value
+    )

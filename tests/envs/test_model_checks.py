@@ -11,13 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
-from rl_yardstick.envs import check_transition_model, checking
-from rl_yardstick.envs.known_models import (
-    model_check,
-    observations_of_states,
-    success_outcomes,
-    transition_model,
-)
+from rl_yardstick.envs import check_transition_model, checking, known_models
 from rl_yardstick.envs.warehouse import WarehouseEnv
 from tests.envs.corridors import Backwards, Corridor, Deaf, altered, outcomes, with_p
 
@@ -146,11 +140,16 @@ def replaced_by_hand():
 
 def test_a_known_class_that_was_changed_is_not_believed_unless_it_does_the_same():
     for env in (Frozen(), replaced_by_hand()):
-        assert transition_model(env) is success_outcomes(env) is observations_of_states(env) is None
-    assert "a method was replaced by hand" in model_check(env).refusal
-    ours, known = (transition_model(env) for env in (Same(), FrozenLakeEnv()))
+        assert (
+            known_models.transition_model(env)
+            is known_models.success_outcomes(env)
+            is known_models.observations_of_states(env)
+            is None
+        )
+    assert "a method was replaced by hand" in known_models.model_check(env).refusal
+    ours, known = (known_models.transition_model(env) for env in (Same(), FrozenLakeEnv()))
     np.testing.assert_array_equal(ours.prob, known.prob)
-    assert transition_model(type("Plain", (WarehouseEnv,), {})(slip=0.1)) is not None
+    assert known_models.transition_model(type("Plain", (WarehouseEnv,), {})(slip=0.1)) is not None
 
 
 def test_the_caller_notices_nothing():
@@ -168,7 +167,7 @@ def test_the_caller_notices_nothing():
 
     before = copy.deepcopy(state())
     check_transition_model(env, n_steps=FEW)
-    assert transition_model(env) is not None
+    assert known_models.transition_model(env) is not None
     assert state() == before
 
 
@@ -207,9 +206,13 @@ def test_environments_made_alike_are_checked_once_until_their_model_changes():
     for seed in range(2):
         env = gym.make("Counted-v0")
         env.reset(seed=seed)
-        for known in (transition_model, observations_of_states, transition_model):
+        for known in (
+            known_models.transition_model,
+            known_models.observations_of_states,
+            known_models.transition_model,
+        ):
             assert known(env) is not None
             tried.add(Counted.tried)
     assert len(tried) == 1
     env.unwrapped.P = outcomes(wind=0.6)
-    assert transition_model(env) is None
+    assert known_models.transition_model(env) is None
