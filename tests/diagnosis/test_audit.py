@@ -13,11 +13,7 @@ from rl_yardstick.diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, 
 from rl_yardstick.diagnosis.target_probes import watkins_table
 from tests.diagnosis import planted
 
-q_learning, sarsa = (
-    partial(planted.one_step, target="max"),
-    partial(planted.one_step, target="next"),
-)
-
+q_learning, sarsa = (partial(planted.one_step, target=target) for target in ("max", "next"))
 
 QUICK = {"policy_kwargs": {"net_arch": []}, "learning_rate": 0.03, "batch_size": 32}
 QUICK |= {"target_update_interval": 10, "learning_starts": 10, "train_freq": 1}
@@ -72,13 +68,10 @@ OF_CLASSES = {  # a class: its fault, and the probe that sees it
     "PPOEntropy": ("entropy-sign", agent_probes.probe_entropy),
 }
 RIGHT_CLASSES = {
-    "dqn": (
-        target_probes.probe_target_network,
-        target_probes.probe_copies,
-        agent_probes.probe_files,
-    ),
-    "ppo": (target_probes.probe_ratio,),
-}
+    "dqn": [target_probes.probe_target_network, target_probes.probe_copies,
+            agent_probes.probe_files],
+    "ppo": [target_probes.probe_ratio],
+}  # fmt: skip
 
 
 def test_each_fault_is_planted_once():
@@ -123,25 +116,19 @@ def test_right_classes_pass(name):
     assert {found.state for found in audit(of_class(name), [0], RIGHT_CLASSES[name])} == {"ok"}
 
 
-def restless(make_env, seed, gamma, steps):
-    """Values that never come to rest."""
-    agent = q_learning(make_env, seed, gamma, steps)
-    agent.values = lambda obs: np.full(2, float(steps))
-    return agent
+UNSAID = [  # values by the table's and the steps, and what is said of them
+    (lambda values, steps: np.full(2, float(steps)), "did not settle"),
+    (lambda values, steps: values + 3, "4.00 and not 1: no fault known here explains it"),
+]
 
 
-def shifted(make_env, seed, gamma, steps):
-    """Values that no fault explains."""
-    agent = q_learning(make_env, seed, gamma, steps)
-    agent.values = lambda obs: agent.table[planted.number(obs)] + 3
-    return agent
+@pytest.mark.parametrize(("shown", "said"), UNSAID)
+def test_no_verdict_where_nothing_is_known(shown, said):
+    def train(make_env, seed, gamma, steps):
+        agent = q_learning(make_env, seed, gamma, steps)
+        agent.values = lambda obs: shown(agent.table[planted.number(obs)], steps)
+        return agent
 
-
-@pytest.mark.parametrize(
-    ("train", "said"),
-    [(restless, "did not settle"), (shifted, "4.00 and not 1: no fault known here explains it")],
-)
-def test_no_verdict_where_nothing_is_known(train, said):
     findings = tuple(audit(script(train, "q_learning"), [0], [target_probes.probe_ends]))
     assert [(finding.state, finding.fault) for finding in findings] == [("unsaid", "")]
     assert said in findings[0].text
