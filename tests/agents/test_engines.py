@@ -29,7 +29,7 @@ from rl_yardstick.envs.known_models import transition_model
 from tests.agents import trainings
 from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 
-ENGINES = ("interpreted", "compiled")
+LAKE, ENGINES = trainings.LAKE, ("interpreted", "compiled")
 HOUSE, SLIPPERY = "Warehouse-v0", {"slip": 0.2, "random_start": True}
 IN_BINS = partial(
     wrappers.DiscretizeObservation, bins=50, low=[-0.42, -0.87], high=[0.42, 0.87], dims=[2, 3]
@@ -38,7 +38,7 @@ SWING = {"low": [-2.4, -3, -0.21, -3], "high": [2.4, 3, 0.21, 3], "n_tiles": [2,
 KING = {"moves": "king", "stochastic": True, "max_episode_steps": 99}
 WORLDS = {
     "house": (HOUSE, SLIPPERY),
-    "lake": (trainings.LAKE, {}),
+    "lake": (LAKE, {}),
     "Taxi": ("Taxi-v4", {}),
     "cliff": ("CliffWalking-v1", {}),
     "gambler": ("GamblersProblem-v0", {"goal": 20}),
@@ -180,10 +180,8 @@ CHANGES = {
 @pytest.mark.parametrize("what", CHANGES)
 def test_a_change_counts_in_both_loops(what):
     start = {"initial_q": 0.5 * what.startswith("zeros"), **trainings.CONSTANT}
-    lake, change = (
-        partial(in_world, "sarsa", WORLDS["lake"], **start),
-        trainings.Every(501, CHANGES[what]),
-    )
+    lake = partial(in_world, "sarsa", WORLDS["lake"], **start)
+    change = trainings.Every(501, CHANGES[what])
     models = assert_engines_agree(lake, lambda m: m.learn(1000, callback=copy.copy(change)))
     unchanged = lake().learn(1000)
     assert not np.array_equal(models[0].policy.q_tables, unchanged.policy.q_tables)
@@ -236,12 +234,6 @@ def lake(**kwargs):
     return make_vec_env("FrozenLake-v1", 1, seed=0, **kwargs)
 
 
-def pole(wrapper=lambda env: env, **kwargs):
-    return wrappers.DiscretizeObservation(
-        wrapper(gym.make("CartPole-v1", **kwargs)), bins=4, low=-1, high=1
-    )
-
-
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
     """Checks of a model take many steps, and are kept."""
@@ -254,17 +246,17 @@ def calm():
     return TimeLimit(Corridor(outcomes(wind=0.0)), 10)
 
 
-make_lake = partial(gym.make, "FrozenLake-v1")
 INTERPRETED = {  # reason: environment, settings, callback
     "VecNormalize is not DummyVecEnv": (lambda: VecNormalize(lake(), norm_obs=False),),
     "the environment's transition model is not known": (partial(lake, wrapper_class=Foreign),),
     "rewards are drawn, and the environment's model": (partial(gym.make, "MaximizationBias-v0"),),
     "the environments are not alike": (
-        lambda: DummyVecEnv([make_lake, partial(make_lake, is_slippery=False)]),),
+        lambda: DummyVecEnv([lambda: gym.make(LAKE), lambda: gym.make(LAKE, is_slippery=False)]),),
     "the environment is shown on the screen": (partial(lake, env_kwargs={"render_mode": "human"}),),
     "a time limit lies outside Monitor": (
         partial(lake, wrapper_class=partial(TimeLimit, max_episode_steps=9)),),
-    "under DiscretizeObservation and Monitor alone": (partial(pole, gym.wrappers.Autoreset),),
+    "under DiscretizeObservation and Monitor alone": (
+        lambda: IN_BINS(gym.wrappers.Autoreset(gym.make("CartPole-v1"))),),
     "does not continue from the state": (lambda: TimeLimit(Deaf(), 10),),
     "the environment's P is not what step does: state ": (calm,),
     "schedule is a Python function": (lake, {"learning_rate": lambda progress: 0.1 * progress}),
@@ -297,7 +289,7 @@ def test_the_engine_that_was_asked_for():
     assert in_use == ["interpreted: asked for", "compiled", "compiled"]
     plain = trainings.Plain()
     model.learn(1_000, callback=EveryNTimesteps(100, plain))
-    assert (model.engine_in_use, plain.seen) == ("compiled", 10)
+    assert (model.engine_in_use, plain.n_calls) == ("compiled", 10)
 
 
 def played(kind, engine, **settings):
@@ -359,18 +351,14 @@ def test_an_observation_outside_of_the_space_is_refused(name):
                 model.learn(5)
 
 
-class OwnLearning(load_algorithm("qlearning")):
-    def _learn_from(self, transitions):
-        pass
-
-
 def test_what_python_does_instead_is_not_compiled_away():
+    class OwnLearning(load_algorithm("qlearning")):
+        def _learn_from(self, transitions):
+            pass
+
     model = OwnLearning(env="FrozenLake-v1", seed=0).learn(0)
     reason = "OwnLearning has a _learn_from of its own in Python"
     assert model.engine_in_use == f"interpreted: {reason}"
-
-
-def test_rules_that_are_not_compiled_are_refused():
     with pytest.raises(TypeError, match=r"Plain.next_value is called by compiled code: put @inl"):
 
         class Plain(load_algorithm("qlearning")):
