@@ -31,9 +31,9 @@ def coin(end, reward=1.0):
 
 def test_the_geometric_distribution_to_its_end_cut_off_and_without_end():
     found = mdp.policy_return(coin(0.2, reward=3), np.array([0]), None)
-    figures = (found.expected_length, found.length_variance, found.expected_return)
-    assert figures == pytest.approx((5, 0.8 / 0.04, 15))
-    assert found.return_variance == pytest.approx(9 * 0.8 / 0.04)
+    lengths, returns = (5, 0.8 / 0.04), (15, 9 * 0.8 / 0.04)
+    assert (found.expected_length, found.length_variance) == pytest.approx(lengths)
+    assert (found.expected_return, found.return_variance) == pytest.approx(returns)
     assert found.success_rate is None
     model = coin(0.5)
     found = mdp.policy_return(model, np.array([0]), 3, success=model.terminated)
@@ -111,29 +111,6 @@ def test_wrong_policies_are_refused(policy, horizon, message):
     for function in (mdp.policy_return, mdp.state_visitation):
         with pytest.raises(ValueError, match=message):
             function(coin(0.5), np.array(policy), horizon)
-
-
-LEFT, RIGHT = 0, 1
-
-
-def corridor():
-    """States 0 to 3 in a row, and state 4, which nothing leads to.
-
-    Each step costs 1; left of state 0 is a wall, right of state 3 the exit, worth 10.
-    """
-    next_state = [[0, 1], [0, 2], [1, 3], [2, 3], [4, 4]]
-    reward = [[-1, -1], [-1, -1], [-1, -1], [-1, 10], [50, 50]]
-    return deterministic(next_state, reward, np.arange(10).reshape(5, 2) == 7)
-
-
-def test_what_is_best_in_a_corridor():
-    values, optimal = mdp.optimal_choices(corridor(), 100)
-    assert values.tolist() == [7, 8, 9, 10, 0]
-    assert optimal[:4].tolist() == [[False, True]] * 4
-    # Too late to get out of states 0 and 1: all ways of losing time are equal.
-    values, optimal = mdp.optimal_choices(corridor(), 2)
-    assert values.tolist() == [-2, -2, 9, 10, 0]
-    assert optimal[:4].tolist() == [[True, True], [True, True], [False, True], [False, True]]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from rl_yardstick.mdp import finite_horizon_optimum, gaps, policy_return
 from rl_yardstick.mdp.advantages import discounted_values, expected_estimates
@@ -20,12 +21,8 @@ def models_and_policies(draw, n_policies=1):
         kind = draw(st.sampled_from(["actions", "with time", "probabilities"]))
         if kind == "probabilities":
             return draw(distributions(shape))
-        n_steps = horizon if kind == "with time" else 1
-        rows = [
-            draw(st.lists(st.integers(0, shape[1] - 1), min_size=shape[0], max_size=shape[0]))
-            for _ in range(n_steps)
-        ]
-        return np.array(rows) if kind == "with time" else np.array(rows[0])
+        size = (horizon, shape[0]) if kind == "with time" else shape[0]
+        return draw(hnp.arrays(np.int64, size, elements=st.integers(0, shape[1] - 1)))
 
     return model, horizon, *[policy() for _ in range(n_policies)]
 

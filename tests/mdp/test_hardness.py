@@ -20,7 +20,7 @@ def corridor(n, *, ends):
     return deterministic(np.clip(places + np.array([-1, 1]), 0, n - 1), last, last & ends)
 
 
-def choice(rewards):
+def choice(*rewards):
     """One state, in which each action earns something."""
     return deterministic([[0] * len(rewards)], [rewards], [[False] * len(rewards)])
 
@@ -70,7 +70,7 @@ def test_a_lake_that_is_not_slippery():
 
 def test_two_arms():
     """With 20 pulls left: v = 9.5 * 19, b = 19 and d = 1 for both arms, so m = 6439."""
-    model = choice([1.0, 0.0])
+    model = choice(1.0, 0.0)
     assert hardness.action_gaps(model, finite_horizon_optimum(model, 20)) == (1.0, 1.0)
     lookahead, bound = hardness.looking_ahead(model, 20)
     episodes = math.ceil(8 * (9.5 * 19 + 19 / 6) * math.log(2 * 20 * 2))
@@ -81,10 +81,10 @@ def test_two_arms():
 
 
 def test_arms_that_are_alike_are_no_mistake():
-    found = hardness_of(choice([0.5, 0.5]), 10)
+    found = hardness_of(choice(0.5, 0.5), 10)
     assert (found.smallest_gap, found.mean_gap) == (None, None)
     assert (found.lookahead, found.effective_horizon) == (1, 1.0)
-    alone = hardness_of(choice([0.5]), 10)
+    alone = hardness_of(choice(0.5), 10)
     assert (alone.lookahead, alone.effective_horizon) == (1, None)
 
 

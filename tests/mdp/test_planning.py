@@ -177,6 +177,7 @@ def arrays():
         "reward": np.array([[[2.0, 4.0], [-1.0, 99.0]], [[0.0, 0.0], [7.0, 7.0]]]),
         "terminated": np.array([[[False, True], [False, False]], [[False, False], [False, False]]]),
         "initial": np.array([1.0, 0.0]),
+        "reward_variance": np.ones((2, 2, 2)),
     }
 
 
@@ -194,6 +195,7 @@ def test_sizes_and_derived_arrays():
         ("prob", (0, 1), [1.5, -0.5], r"state 0, action 1 has a probability outside \[0, 1\]"),
         ("next_state", (1, 1, 0), 2, r"state 1, action 1 has a next state outside 0..1"),
         ("reward", (0, 0, 1), np.inf, "state 0, action 0 has a reward that is not finite"),
+        ("reward_variance", (1, 0, 1), -1, "state 1, action 0 has a variance of the reward"),
         ("initial", 0, 0.5, r"initial holds no probabilities that sum to one: \[0.5 0. \]"),
     ],
 )
@@ -206,14 +208,6 @@ def test_wrong_arrays_are_refused(name, place, value, message):
         mdp.TransitionModel(**given)
     with pytest.raises(ValueError, match=r"prob has shape \(2, 4\)"):
         mdp.TransitionModel(**{**given, "prob": given["prob"].reshape(2, 4)})
-
-
-def test_variances_of_rewards_are_checked():
-    variance = np.ones((2, 2, 2))
-    assert mdp.TransitionModel(**arrays(), reward_variance=variance).reward_variance is not None
-    variance[1, 0, 1] = -1
-    with pytest.raises(ValueError, match="state 1, action 0 has a variance of the reward"):
-        mdp.TransitionModel(**arrays(), reward_variance=variance)
 
 
 def test_from_gymnasium_pads_keeps_the_order_and_refuses_gaps():

@@ -54,15 +54,6 @@ def deterministic(next_state, reward, terminated):
     )
 
 
-def continuing(model):
-    """By action, the probabilities of going from state to state without an end, shape (A, S, S)."""
-    found = np.zeros((model.n_actions, model.n_states, model.n_states))
-    states, actions, outcomes = np.nonzero((model.prob > 0) & ~model.terminated)
-    at = states, actions, outcomes
-    np.add.at(found, (actions, states, model.next_state[at]), model.prob[at])
-    return found
-
-
 def moved_on(model, here, chances):
     """The chance to be in each state one step later, by those now and those of the actions."""
     going_on = (here[:, None] * chances)[..., None] * model.prob * ~model.terminated
@@ -83,9 +74,11 @@ def test_discounted_values_of_both_planners_solve_the_equation_of_the_optimum(mo
     assert one.start_value == pytest.approx(model.initial @ two.values, abs=1e-9)
 
 
-def stationary_policies(model):
-    actions = itertools.product(range(model.n_actions), repeat=model.n_states)
-    return [np.array(each) for each in actions]
+def every_policy(model, horizon=None):
+    """All policies of actions by state, or by step and state."""
+    shape = (model.n_states,) if horizon is None else (horizon, model.n_states)
+    choices = itertools.product(range(model.n_actions), repeat=int(np.prod(shape)))
+    return [np.reshape(actions, shape) for actions in choices]
 
 
 def total_rewards(model, policy):
@@ -95,7 +88,9 @@ def total_rewards(model, policy):
     earns or costs for ever; states that the model never reaches count as ends.
     """
     states = np.arange(model.n_states)
-    chain = continuing(model)[policy, states] * np.outer(model.reachable, model.reachable)
+    doing = np.eye(model.n_actions)[policy]
+    chain = np.array([moved_on(model, here, doing) for here in np.eye(model.n_states)])
+    chain *= np.outer(model.reachable, model.reachable)
     reward = model.expected_reward[states, policy] * model.reachable
     leads = np.linalg.matrix_power((chain > 0) + np.eye(model.n_states), model.n_states) > 0
     stays = np.isclose(chain.sum(axis=1), 1)
@@ -125,7 +120,7 @@ def total_rewards(model, policy):
 @settings(max_examples=80)
 @given(models(states=3, actions=2, outcomes=2))
 def test_undiscounted_planning_against_every_stationary_policy(model):
-    totals = np.array([total_rewards(model, policy) for policy in stationary_policies(model)])
+    totals = np.array([total_rewards(model, policy) for policy in every_policy(model)])
     best = totals.max(axis=0)
     starts = model.initial > 0
     if np.isposinf(best).any() or np.isneginf(best[starts]).any():
@@ -160,17 +155,6 @@ def test_no_time_limit_is_a_distant_one(model, data):
         mdp.state_visitation(model, policy, 300),
         atol=1e-9,
     )
-
-
-@settings(max_examples=30)
-@given(models(states=2, actions=2, outcomes=2), st.integers(1, 3))
-def test_the_optimum_under_a_time_limit_against_every_policy(model, horizon):
-    choices = itertools.product(range(model.n_actions), repeat=horizon * model.n_states)
-    best = max(
-        mdp.policy_return(model, np.reshape(actions, (horizon, -1)), horizon).expected_return
-        for actions in choices
-    )
-    assert mdp.finite_horizon_optimum(model, horizon).start_value == pytest.approx(best, abs=1e-12)
 
 
 def moments_by_recursion(model, chances, discount, success):
