@@ -174,20 +174,6 @@ def test_any_json_is_decoded_or_refused(data):
     json.dumps(encode(value))
 
 
-OUT_OF_RANGE = [
-    {"type": "os.system", "n": 3},
-    {"type": "Discrete", "n": 3, "start": 0, "rng": 7},
-    {"type": "ndarray", "dtype": "O", "values": [1], "shape": [1]},
-    {"type": "ExponentialSchedule", "start": 0.0, "end": 1.0, "end_fraction": 1.0},
-]
-
-
-@pytest.mark.parametrize("damage", OUT_OF_RANGE, ids=str)
-def test_what_is_not_in_the_table_or_out_of_range_is_not_built(damage):
-    with pytest.raises(ValueError, match=r"."):
-        decode(damage)
-
-
 @pytest.mark.parametrize("name", ["qlearning", "reinforce", "ucb", "optimal"])
 def test_custom_objects_replace_what_the_file_holds_and_nothing_else(name, tmp_path):
     model = load_algorithm(name)(env="SegmentBandit-v0" if name == "ucb" else "FrozenLake-v1")

@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import FloatSchedule
 
@@ -148,25 +147,6 @@ def test_termination_leaves_the_reward_alone_and_truncation_does_not(name):
         assert changed == (end != "terminated")
 
 
-class Tracer(BaseCallback):
-    actions, commitments = (), ()
-
-    def _on_step(self):
-        self.actions += (int(self.locals["actions"][0]),)
-        return True
-
-    def _on_rollout_end(self):
-        self.commitments += (int(self.model._next_actions[0]),)
-
-
-def test_sarsa_does_what_it_committed_to():
-    tracer, env = Tracer(), gym.make("RiverSwim-v0", max_episode_steps=-1)
-    uniform = {"exploration_decay": "constant", "exploration_initial_eps": 1.0}
-    load_algorithm("sarsa")(env=env, seed=0, **uniform).learn(300, callback=tracer)
-    assert tracer.commitments[:-1] == tracer.actions[1:]
-    assert set(tracer.actions) == {0, 1}
-
-
 def test_one_update_by_hand():
     """Thrice the same step: state 0, action 1, reward 2, then state 1; H = 3, bonus 6 / sqrt(N)."""
     settings = {"value_bound": 10.0, "bonus_scale": 6.0, "horizon": 3.0}
@@ -261,12 +241,3 @@ def test_r_max_plans_the_optimum_of_what_it_has_counted():
     )
     optimum = value_iteration(counted, 0.9).action_values
     np.testing.assert_allclose(agent.policy.q_table, optimum, atol=1e-8)
-
-
-def test_q_learning_chooses_after_the_update():
-    """Action 0 earns next to nothing, so that its value falls below that of action 1."""
-    tracer, settings = Tracer(), {"learning_rate": 0.5, "gamma": 0.0, "initial_q": 1.0}
-    settings |= {"exploration_decay": "constant", "exploration_initial_eps": 0.0}
-    model = load_algorithm("qlearning")(env="RiverSwim-v0", tie_breaking="first", **settings)
-    model.learn(2, callback=tracer)
-    assert tracer.actions == (0, 1)

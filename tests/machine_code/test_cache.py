@@ -199,26 +199,6 @@ def test_parts_are_compiled_once_and_only_python_is_refused():
     assert total(numbers, 2) == 42
 
 
-def test_without_the_compiler_python_plans_and_evaluates():
-    code = """
-import gymnasium
-from rl_yardstick.envs.known_models import transition_model
-from rl_yardstick.mdp import finite_horizon_optimum, policy_return
-for name in ("rl_yardstick.envs:Warehouse-v0", "FrozenLake-v1"):
-    model = transition_model(gymnasium.make(name))
-    plan = finite_horizon_optimum(model, 100)
-    print(plan.start_value, policy_return(model, plan.policy, 100).expected_return)
-"""
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
-    warehouse, frozen_lake = (line.split() for line in done.stdout.splitlines())
-    assert warehouse == ["79.0", "79.0"]
-    planned, earned = map(float, frozen_lake)
-    assert earned == pytest.approx(planned, abs=1e-12)
-
-
 def test_compiling_is_timed_as_a_whole():
     @compiled
     def inner(x):

@@ -34,18 +34,15 @@ def test_a_mean_has_students_interval_cut_at_what_is_possible():
         ([0.1] * 7, 0.1, (0.1, 0.1)),
         ([3.0, 1.0, 2.0, 2.0], 2, (1, 3)),  # below five runs their range
         ([4.0], 4, (4, 4)),
+        ([], NAN, (NAN, NAN)),
+        ([NAN, INF], NAN, (NAN, NAN)),
     ],
 )
-def test_equal_and_few_runs(runs, point, interval):
+def test_equal_few_and_no_runs(runs, point, interval):
     found = verdicts.mean_over_runs(runs)
-    assert (found.point, ends(found), found.is_range) == (point, interval, len(runs) < 5)
-
-
-@pytest.mark.parametrize("runs", [[], [NAN], [NAN, INF]])
-def test_without_a_run_there_is_no_figure(runs):
-    found = verdicts.mean_over_runs(runs)
-    assert np.isnan([found.point, found.low, found.high]).all()
-    assert found.n_missing == len(runs)
+    assert [found.point, *ends(found)] == pytest.approx([point, *interval], abs=0, nan_ok=True)
+    assert found.is_range == (len(runs) < 5)
+    assert found.n_missing == (len(runs) if math.isnan(point) else 0)
 
 
 @pytest.mark.parametrize("n", [6, 9, 16, 30])
@@ -55,10 +52,7 @@ def test_the_interval_of_the_median_covers_and_is_the_shortest_that_does(n):
     assert (found.point, found.high) == ((n - 1) / 2, n - 1 - cut)
     covered = [1 - 2 * stats.binom.cdf(outside, n, 0.5) for outside in (cut, cut + 1)]
     assert covered[0] >= 0.95 > covered[1]
-
-
-def test_five_runs_have_their_range_as_interval_of_the_median():
-    assert ends(median_over_runs([5, 1, 2, 4, 3])) == (1, 5)
+    assert ends(median_over_runs([5, 1, 2, 4, 3])) == (1, 5)  # where no interval covers
 
 
 def test_the_middle_half():
@@ -72,14 +66,6 @@ def test_a_share_has_the_interval_of_clopper_and_pearson():
     for count, n in ((0, 10), (3, 10), (10, 10), (1, 200)):
         exact = stats.binomtest(count, n).proportion_ci(0.95, method="exact")
         assert share_interval(count, n) == pytest.approx((exact.low, exact.high))
-
-
-@pytest.mark.parametrize("n", [5, 30])
-def test_intervals_over_normal_runs_cover(n):
-    """Of 2,000 intervals; the standard error is 0.005 at 0.95."""
-    draws = np.random.default_rng(7).normal(3, 2, (2000, n))
-    found = [ends(verdicts.mean_over_runs(runs)) for runs in draws]
-    assert np.mean([low <= 3 <= high for low, high in found]) == pytest.approx(0.95, abs=0.02)
 
 
 @pytest.mark.parametrize(
