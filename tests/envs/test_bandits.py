@@ -10,7 +10,8 @@ from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 
 import rl_yardstick.envs  # noqa: F401 (registers the environments)
-from rl_yardstick.envs import bandits, known_models
+from rl_yardstick.envs import bandits
+from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.wrappers import ScaleReward
 from rl_yardstick.mdp import baseline_return, finite_horizon_optimum, policy_return
 
@@ -90,10 +91,10 @@ def test_each_of_several_best_arms_has_no_regret():
 def test_an_episode_ends_after_its_pulls():
     for kwargs, length in (({}, 1000), ({"max_episode_steps": 40, "pulls": 30}, 40)):
         env = gym.make("GaussianBandit-v0", **kwargs)
-        assert known_models.time_limit(env) == env.spec.max_episode_steps == length
+        assert known.time_limit(env) == env.spec.max_episode_steps == length
         env.reset(seed=0)
         assert [env.step(0)[2:4] for _ in range(length)][-2:] == [(False, False), (False, True)]
-    assert known_models.time_limit(gym.make("GaussianBandit-v0", max_episode_steps=-1)) is None
+    assert known.time_limit(gym.make("GaussianBandit-v0", max_episode_steps=-1)) is None
 
 
 def test_feedback_is_due_at_the_end_of_each_batch_and_of_the_episode():
@@ -106,18 +107,18 @@ def test_feedback_is_due_at_the_end_of_each_batch_and_of_the_episode():
 
 def test_what_a_pooled_test_of_segments_loses_is_exact():
     env = gym.make("SegmentBandit-v0")
-    model, horizon = known_models.transition_model(env), known_models.time_limit(env)
+    model, horizon = known.transition_model(env), known.time_limit(env)
     best = finite_horizon_optimum(model, horizon).start_value / horizon
     random = policy_return(model, np.full((2, 3), 1 / 3), horizon).expected_return / horizon
     assert baseline_return(model, horizon) / horizon == pytest.approx(0.117, abs=1e-12)
     assert best == pytest.approx(0.159, abs=1e-12)
     assert (best - random) * 10_000 == pytest.approx(653.3, abs=0.1)
     env = ScaleReward(gym.make("BernoulliBandit-v0"), 2)  # of coins
-    model = known_models.transition_model(env)
+    model = known.transition_model(env)
     assert (model.n_states, model.n_outcomes, model.terminated.any()) == (1, 2, False)
     assert model.expected_reward.tolist() == [[0.4, 1.0, 1.5]]
-    assert known_models.observations_of_states(env).tolist() == [0]
-    assert known_models.success_outcomes(env) is None
+    assert known.observations_of_states(env).tolist() == [0]
+    assert known.success_outcomes(env) is None
 
 
 @pytest.fixture
@@ -223,7 +224,7 @@ def test_replay_by_hand(tmp_path):
         gym.make("ReplayBandit-v0", log=str(tmp_path / "missing.csv"))
     env = gym.make("ReplayBandit-v0", log=str(LOG))
     assert (env.observation_space, env.action_space) == (spaces.Discrete(2), spaces.Discrete(2))
-    assert (known_models.time_limit(env), known_models.transition_model(env)) == (7, None)
+    assert (known.time_limit(env), known.transition_model(env)) == (7, None)
     # Context after the step, reward, matched, matched pulls so far; the arm pulled is always 0.
     expected = [
         (0, 1.0, True, 1),

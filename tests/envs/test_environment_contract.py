@@ -18,7 +18,8 @@ from gymnasium.utils import env_checker
 from gymnasium.wrappers import TimeLimit
 
 import rl_yardstick.envs  # noqa: F401 (registers the environments)
-from rl_yardstick.envs import known_models, wrappers
+from rl_yardstick.envs import known_models as known
+from rl_yardstick.envs import wrappers
 from rl_yardstick.envs.mine_maze import MineMazeEnv
 from rl_yardstick.mdp import TransitionModel
 
@@ -293,9 +294,9 @@ def test_moves_that_bump_and_actions_that_are_idle_are_masked():
     env = gym.make("Warehouse-v0", desc=["S#", ".G"])
     # Of the start: up leaves the map, down is free, left leaves it, right is a shelf.
     expected = [[0, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
-    np.testing.assert_array_equal(known_models.action_masks_of_states(env), expected)
+    np.testing.assert_array_equal(known.action_masks_of_states(env), expected)
     for env in (MineMazeEnv(slip=0.3), wrappers.IdleActionMasks(gym.make("CliffWalking-v1"))):
-        model, masks = known_models.transition_model(env), known_models.action_masks_of_states(env)
+        model, masks = known.transition_model(env), known.action_masks_of_states(env)
         # The first outcome is the one that is meant.
         goes = model.next_state[:, :, 0] != np.arange(model.n_states)[:, None]
         np.testing.assert_array_equal(masks, goes | model.terminated[:, :, 0])
@@ -317,8 +318,8 @@ MASKED = {
 @pytest.mark.parametrize("name", MASKED)
 def test_masks_of_all_states_are_those_told_on_the_way(name):
     bare = MASKED[name]()
-    masks = known_models.action_masks_of_states(bare)
-    assert masks.shape == (len(known_models.observations_of_states(bare)), bare.action_space.n)
+    masks = known.action_masks_of_states(bare)
+    assert masks.shape == (len(known.observations_of_states(bare)), bare.action_space.n)
     assert masks.any(axis=1).all()
     env, rng = wrappers.ActionMasks(bare), np.random.default_rng(0)
     _, info = env.reset(seed=0)
@@ -341,8 +342,8 @@ class OwnMasks(MineMazeEnv):
 def test_masks_that_are_not_there_are_not_guessed():
     for env_id in ("CartPole-v1", "FrozenLake-v1", "BernoulliBandit-v0"):
         env = gym.make(env_id)
-        assert wrappers.action_masks(env) is known_models.action_masks_of_states(env) is None
-    assert known_models.action_masks_of_states(OwnMasks()) is None
+        assert wrappers.action_masks(env) is known.action_masks_of_states(env) is None
+    assert known.action_masks_of_states(OwnMasks()) is None
     assert wrappers.action_masks(OwnMasks()).tolist() == [False, True, True, True]
     # A wrapper that nobody here knows may mask as well.
-    assert known_models.action_masks_of_states(gym.Wrapper(MineMazeEnv())) is None
+    assert known.action_masks_of_states(gym.Wrapper(MineMazeEnv())) is None

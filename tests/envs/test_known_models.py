@@ -11,7 +11,8 @@ from stable_baselines3.common.monitor import Monitor
 
 import rl_yardstick.envs  # noqa: F401 (registers the environments)
 import train
-from rl_yardstick.envs import brackets, known_models, wrappers
+from rl_yardstick.envs import brackets, wrappers
+from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.layout import action_names, grid_layout, state_name
 
 EIGHT = {"map_name": "8x8", "success_rate": 0.6, "reward_schedule": (3, -2, -0.1)}
@@ -47,9 +48,9 @@ def first_above(probabilities, uniform):
 def assert_replays(env, steps=500):
     """Predict every start and step from the model and a generator of the same seed."""
     model, base, observations = (
-        known_models.transition_model(env),
+        known.transition_model(env),
         env.unwrapped,
-        known_models.observations_of_states(env),
+        known.observations_of_states(env),
     )
     uniform = np_random(3)[0].random
     first, _ = env.reset(seed=3)
@@ -104,21 +105,17 @@ def test_what_wrappers_do_to_observations_is_folded_in():
     assert_replays(wrappers.OneHotObservation(wrappers.FlattenToDiscrete(lake)), steps=200)
     assert_replays(wrappers.DiscretizeObservation(position, bins=4), steps=200)
     np.testing.assert_array_equal(
-        known_models.observations_of_states(wrappers.OneHotObservation(lake)), np.eye(16)
+        known.observations_of_states(wrappers.OneHotObservation(lake)), np.eye(16)
     )
     # Where it is not known what is seen, the model is known all the same.
-    assert known_models.observations_of_states(gym.wrappers.TimeAwareObservation(lake)) is None
+    assert known.observations_of_states(gym.wrappers.TimeAwareObservation(lake)) is None
 
 
 def test_what_wrappers_make_of_drawn_rewards():
     env = gym.make("MaximizationBias-v0", reward_std=2)
-    assert (
-        known_models.transition_model(wrappers.ScaleReward(env, 3)).reward_variance[1, 0, 0] == 36
-    )
-    assert not known_models.transition_model(
-        wrappers.TerminationReward(env, -5)
-    ).reward_variance.any()
-    assert known_models.transition_model(gym.wrappers.ClipReward(env, -1, 1)) is None
+    assert known.transition_model(wrappers.ScaleReward(env, 3)).reward_variance[1, 0, 0] == 36
+    assert not known.transition_model(wrappers.TerminationReward(env, -5)).reward_variance.any()
+    assert known.transition_model(gym.wrappers.ClipReward(env, -1, 1)) is None
 
 
 class Anything(gym.Wrapper):
@@ -126,55 +123,37 @@ class Anything(gym.Wrapper):
 
 
 UNKNOWN = {
-    "function": lambda env: gym.wrappers.TransformReward(env, lambda reward: reward),
-    "on_truncation": lambda env: wrappers.TerminationReward(env, -10, on_truncation=True),
-    "inside": lambda env: Monitor(Anything(env)),
-}
+    "function": lambda: gym.wrappers.TransformReward(make("FrozenLake"), lambda reward: reward),
+    "on_truncation": lambda: wrappers.TerminationReward(make("Taxi"), -10, on_truncation=True),
+    "inside": lambda: Monitor(Anything(make("FrozenLake"))),
+    "CartPole": lambda: gym.make("CartPole-v1"),
+    "fickle": lambda: gym.make("Taxi-v4", fickle_passenger=True),
+    "Gaussian": lambda: gym.make("GaussianBandit-v0"),
+    "changing": lambda: gym.make(
+        "DynaMaze-v0", maze="blocking", changed=True, change_after_steps=9),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("wrap", UNKNOWN)
-def test_unknown_wrappers_hide_the_model(wrap):
-    env = UNKNOWN[wrap](gym.make("FrozenLake-v1"))
-    assert (
-        known_models.transition_model(env)
-        is known_models.success_outcomes(env)
-        is known_models.model_check(env)
-        is None
-    )
-
-
-def test_environments_without_a_model():
-    changing = {"maze": "blocking", "changed": True, "change_after_steps": 9}
-    for env in (
-        gym.make("CartPole-v1"),
-        gym.make("Taxi-v4", fickle_passenger=True),
-        gym.make("GaussianBandit-v0"),
-        gym.make("DynaMaze-v0", **changing),
-    ):
-        for known in (
-            known_models.transition_model,
-            known_models.success_outcomes,
-            known_models.observations_of_states,
-            known_models.model_check,
-        ):
-            assert known(env) is None
+@pytest.mark.parametrize("what", UNKNOWN)
+def test_nothing_is_told_where_the_model_is_not_known(what):
+    env = UNKNOWN[what]()
+    tellers = known.transition_model, known.success_outcomes, known.model_check
+    assert [teller(env) for teller in tellers] == [None] * 3
+    is_seen = what in {"on_truncation", "function"}
+    assert is_seen or known.observations_of_states(env) is None
 
 
 def test_time_limits_and_models_that_are_none():
     for env_id, limit in (("MineMaze-v0", 100), ("CliffWalking-v1", None)):
         env = gym.make(env_id)
-        assert known_models.time_limit(env) == limit
-        assert known_models.time_limit(Monitor(gym.wrappers.TimeLimit(env, 5000))) == (
-            limit or 5000
-        )
-        assert (
-            known_models.time_limit(gym.wrappers.TimeLimit(wrappers.ScaleReward(env, 0.5), 7)) == 7
-        )
+        assert known.time_limit(env) == limit
+        assert known.time_limit(Monitor(gym.wrappers.TimeLimit(env, 5000))) == (limit or 5000)
+        assert known.time_limit(gym.wrappers.TimeLimit(wrappers.ScaleReward(env, 0.5), 7)) == 7
     env = make("FrozenLake")
     env.unwrapped.P[3][1] = [(0.5, 0, 0.0, False)]
-    assert known_models.transition_model(env) is None
+    assert known.transition_model(env) is None
     line = "state 3, action 1 has probabilities that do not sum to one"
-    assert known_models.model_check(env).refusal == f"the environment's P is no model: {line}"
+    assert known.model_check(env).refusal == f"the environment's P is no model: {line}"
 
 
 SUCCESSES = {
@@ -188,7 +167,7 @@ SUCCESSES = {
 
 @pytest.mark.parametrize("name", SUCCESSES)
 def test_the_transitions_that_count_as_success(name):
-    found = np.argwhere(known_models.success_outcomes(make(name))).tolist()
+    found = np.argwhere(known.success_outcomes(make(name))).tolist()
     assert [(state, action) for state, action, _ in found] == SUCCESSES[name]
 
 
@@ -205,7 +184,7 @@ def test_moves_lead_where_the_layout_says(name):
     env = make(name)
     layout, model = (
         grid_layout(gym.wrappers.RecordEpisodeStatistics(env)),
-        known_models.transition_model(env),
+        known.transition_model(env),
     )
     first, names, moves = LAYOUTS[name]
     assert (layout.rows[0], layout.names, layout.moves) == (first, names, moves)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
-from rl_yardstick.envs import check_transition_model, checking, known_models
+from rl_yardstick.envs import check_transition_model, checking
+from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.warehouse import WarehouseEnv
 from tests.envs.corridors import Backwards, Corridor, Deaf, altered, outcomes, with_p
 
@@ -139,17 +140,13 @@ def replaced_by_hand():
 
 
 def test_a_known_class_that_was_changed_is_not_believed_unless_it_does_the_same():
+    tellers = known.transition_model, known.success_outcomes, known.observations_of_states
     for env in (Frozen(), replaced_by_hand()):
-        assert (
-            known_models.transition_model(env)
-            is known_models.success_outcomes(env)
-            is known_models.observations_of_states(env)
-            is None
-        )
-    assert "a method was replaced by hand" in known_models.model_check(env).refusal
-    ours, known = (known_models.transition_model(env) for env in (Same(), FrozenLakeEnv()))
-    np.testing.assert_array_equal(ours.prob, known.prob)
-    assert known_models.transition_model(type("Plain", (WarehouseEnv,), {})(slip=0.1)) is not None
+        assert [teller(env) for teller in tellers] == [None] * 3
+    assert "a method was replaced by hand" in known.model_check(env).refusal
+    ours, theirs = (known.transition_model(env) for env in (Same(), FrozenLakeEnv()))
+    np.testing.assert_array_equal(ours.prob, theirs.prob)
+    assert known.transition_model(type("Plain", (WarehouseEnv,), {})(slip=0.1)) is not None
 
 
 def test_the_caller_notices_nothing():
@@ -167,7 +164,7 @@ def test_the_caller_notices_nothing():
 
     before = copy.deepcopy(state())
     check_transition_model(env, n_steps=FEW)
-    assert known_models.transition_model(env) is not None
+    assert known.transition_model(env) is not None
     assert state() == before
 
 
@@ -190,6 +187,6 @@ gym.register("Locked-v0", entry_point=Locked)
 
 def test_a_model_that_changes_is_checked_anew():
     env = Corridor()
-    assert known_models.transition_model(env) is not None
+    assert known.transition_model(env) is not None
     env.P = outcomes(wind=0.6)
-    assert known_models.transition_model(env) is None
+    assert known.transition_model(env) is None

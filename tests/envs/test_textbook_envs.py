@@ -11,18 +11,18 @@ import rl_yardstick.envs  # noqa: F401 (registers the environments)
 from rl_yardstick import mdp
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.compiled.worlds import NotCompilable, compile_envs
-from rl_yardstick.envs import known_models
+from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.blackjack_model import blackjack_observations, natural_state, state_of
 from rl_yardstick.envs.textbook.racetrack import LEFT_TRACK
 from rl_yardstick.envs.wrappers import FlattenToDiscrete
 
 
 def model_of(env_id, **kwargs):
-    return known_models.transition_model(gym.make(env_id, **kwargs))
+    return known.transition_model(gym.make(env_id, **kwargs))
 
 
 def optimum_of(env_id, **kwargs):
-    limit = known_models.time_limit(gym.make(env_id, **kwargs))
+    limit = known.time_limit(gym.make(env_id, **kwargs))
     return mdp.finite_horizon_optimum(model_of(env_id, **kwargs), limit).start_value
 
 
@@ -97,12 +97,12 @@ def test_a_stake_that_is_too_large_is_not_taken():
     reached = [set(model.next_state[30, action].tolist()) for action in (31, 0, 30)]
     assert reached == [{30}, {30}, {0, 60}]
     env = gym.make("GamblersProblem-v0")
-    masks = known_models.action_masks_of_states(env)
+    masks = known.action_masks_of_states(env)
     assert masks[30].tolist() == [True] * 31 + [False] * 20
     assert masks[90].sum() == 11
     np.testing.assert_allclose(env.unwrapped.initial_state_distrib[1:100], 1 / 99)
     assert gym.make("GamblersProblem-v0", start_capital=7).reset()[0] == 7
-    assert known_models.success_outcomes(env)[50, 50].tolist() == [True, False]
+    assert known.success_outcomes(env)[50, 50].tolist() == [True, False]
 
 
 def test_right_is_the_optimum_of_maximization_bias():
@@ -114,7 +114,7 @@ def test_right_is_the_optimum_of_maximization_bias():
     assert [result.expected_length for result in found] == [2.0, 1.0]
     # In A two actions are allowed, and the others repeat them.
     assert model.next_state[2, :, 0].tolist() == [1, 3, 1, 3, 1]
-    masks = known_models.action_masks_of_states(gym.make("MaximizationBias-v0", n_actions=5))
+    masks = known.action_masks_of_states(gym.make("MaximizationBias-v0", n_actions=5))
     assert masks[2].tolist() == [True, True, False, False, False]
     assert masks[1].all()
 
@@ -143,7 +143,7 @@ def test_the_treasure_is_worth_99_hundredths(size, map_seed):
     slippery = optimum_of("DeepSea-v0", deterministic=False, **kwargs)
     assert slippery == pytest.approx(best, abs=1e-12)
     # From the top left, to the right: one row below, in the next column or in the same.
-    model = known_models.transition_model(gym.make("DeepSea-v0", deterministic=False, **kwargs))
+    model = known.transition_model(gym.make("DeepSea-v0", deterministic=False, **kwargs))
     right = 1 if map_seed is None else int(model.prob[0, 1, 1] > 0)
     assert model.next_state[0, right].tolist() == [size + 1, size]
     assert model.prob[0, right].tolist() == [1 - 1 / size, 1 / size]
@@ -219,14 +219,14 @@ def test_the_exercise_adds_a_free_move_and_fees_for_parking():
     np.testing.assert_array_equal(models[0].prob, models[1].prob)
     found = (models[1].expected_reward - models[0].expected_reward).reshape(N, N, 11)
     np.testing.assert_allclose(found[possible], added[possible], atol=1e-9)
-    assert np.array_equal(known_models.action_masks_of_states(example).reshape(N, N, 11), possible)
+    assert np.array_equal(known.action_masks_of_states(example).reshape(N, N, 11), possible)
     # More cars than there are cannot be moved: 2 and 0 of them here.
     for array in (models[0].prob, models[0].reward):
         np.testing.assert_array_equal(array[2 * N, [10, 0]], array[2 * N, [7, 5]])
 
 
 def test_optimal_values_and_policy_are_those_of_figure_4_2():
-    masks = known_models.action_masks_of_states(gym.make("JacksCarRental-v0"))
+    masks = known.action_masks_of_states(gym.make("JacksCarRental-v0"))
     plan = mdp.policy_iteration(model_of("JacksCarRental-v0"), 0.9, mask=masks)
     values, moves = plan.values.reshape(N, N), plan.policy.reshape(N, N) - 5
     assert (values[20, 20], values[0, 0]) == pytest.approx((636.99, 421.41), abs=0.005)
@@ -272,7 +272,7 @@ STICK, HIT = 0, 1
 
 
 def blackjack(rules):
-    return known_models.transition_model(FlattenToDiscrete(gym.make("Blackjack-v1", **rules)))
+    return known.transition_model(FlattenToDiscrete(gym.make("Blackjack-v1", **rules)))
 
 
 def test_the_optimum_is_the_one_that_is_published():
@@ -300,11 +300,11 @@ def test_the_policy_is_that_of_figure_5_2():
 def test_a_natural_looks_as_any_21_does_and_wins_are_successes():
     seen = blackjack_observations()
     assert seen[natural_state(10)].tolist() == seen[state_of(21, 10, True)].tolist() == [21, 10, 1]
-    flat = known_models.observations_of_states(FlattenToDiscrete(gym.make("Blackjack-v1")))
+    flat = known.observations_of_states(FlattenToDiscrete(gym.make("Blackjack-v1")))
     assert flat[:704].tolist() == list(range(704))
     assert flat[natural_state(3)] == state_of(21, 3, True)
     env = gym.make("Blackjack-v1", natural=True, sab=False)
-    model, wins = known_models.transition_model(env), known_models.success_outcomes(env)
+    model, wins = known.transition_model(env), known.success_outcomes(env)
     assert set(model.reward[wins].tolist()) == {1.0, 1.5}
     # With this rule a natural that beats the dealer's 20 pays more, and no other hand.
     paid = (model.reward == 1.5) & (model.prob > 0)
@@ -318,9 +318,7 @@ class Cheating(BlackjackEnv):
 def test_another_blackjack_is_not_believed_and_none_is_compiled():
     changed = BlackjackEnv()
     changed.step = lambda action: None
-    assert (
-        known_models.transition_model(Cheating()) is known_models.transition_model(changed) is None
-    )
+    assert known.transition_model(Cheating()) is known.transition_model(changed) is None
     agent = load_algorithm("qlearning")(env=FlattenToDiscrete(gym.make("Blackjack-v1")))
     with pytest.raises(NotCompilable, match="does not continue from the state"):
         compile_envs(agent.env)
@@ -328,7 +326,7 @@ def test_another_blackjack_is_not_believed_and_none_is_compiled():
 
 def chances(env_id, state, action, **kwargs):
     """What may come of an action: the chance of each state, by its number."""
-    model = known_models.transition_model(gym.make(env_id, **kwargs))
+    model = known.transition_model(gym.make(env_id, **kwargs))
     found = np.zeros(model.n_states)
     np.add.at(found, model.next_state[state, action], model.prob[state, action])
     return found
@@ -336,7 +334,7 @@ def chances(env_id, state, action, **kwargs):
 
 def test_the_tiger_is_heard_where_it_is_with_the_accuracy():
     env = gym.make("Tiger-v0", accuracy=0.8)
-    model, heard = known_models.transition_model(env), known_models.observations_of_states(env)
+    model, heard = known.transition_model(env), known.observations_of_states(env)
     hidden = [env.unwrapped.cell_of(state) for state in range(6)]
     assert list(zip(hidden, heard.tolist(), strict=True)) == [
         (tiger, sound) for tiger in (0, 1) for sound in (0, 1, 2)
@@ -348,14 +346,12 @@ def test_the_tiger_is_heard_where_it_is_with_the_accuracy():
         expected[3 * hidden[state] + 1], expected[3 * hidden[state] + 2] = near, far
         np.testing.assert_allclose(chances("Tiger-v0", state, 0, accuracy=0.8), expected)
         for door in (1, 2):
-            np.testing.assert_allclose(
-                chances("Tiger-v0", state, door, accuracy=0.8), [0.5, 0, 0, 0.5, 0, 0]
-            )
+            np.testing.assert_allclose(chances("Tiger-v0", state, door), [0.5, 0, 0, 0.5, 0, 0])
     rewards = [[-1.0, -100.0, 10.0]] * 3 + [[-1.0, 10.0, -100.0]] * 3
     np.testing.assert_allclose(model.expected_reward, rewards)
-    assert mdp.finite_horizon_optimum(
-        model, known_models.time_limit(env)
-    ).start_value == pytest.approx(100)
+    assert mdp.finite_horizon_optimum(model, known.time_limit(env)).start_value == pytest.approx(
+        100
+    )
 
 
 NORTH, EAST, SOUTH, WEST = range(4)
@@ -407,7 +403,7 @@ def test_readings_are_those_of_the_original():
     from rl_yardstick.envs.pomdp.hallway import _world
 
     env, world = gym.make("Hallway-v0"), _world()
-    model = known_models.transition_model(env)
+    model = known.transition_model(env)
 
     def readings(cell, facing):
         """The chances of readings at the start, given where that is, as they are after staying."""
@@ -437,7 +433,7 @@ def test_readings_are_those_of_the_original():
 
 def test_the_dark_shows_the_four_cells_beside():
     env = gym.make("DarkWarehouse-v0", desc=["S.G", "#.."], random_start=False)
-    seen = known_models.observations_of_states(env)
+    seen = known.observations_of_states(env)
     # Above, below, left, right, in base 3: 1 a shelf or the wall, 2 the goal.
     assert [np.base_repr(code, 3).zfill(4) for code in seen.tolist()] == [
         "1110", "1002", "1001", "0110", "0110", "2101",
