@@ -23,7 +23,7 @@ import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.envs import checking as model_checks
-from rl_yardstick.envs import wrappers
+from rl_yardstick.envs import wrappers as wrap
 from rl_yardstick.envs.grid import Tile
 from rl_yardstick.envs.known_models import transition_model
 from tests.agents import trainings
@@ -32,7 +32,7 @@ from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 LAKE, ENGINES = trainings.LAKE, ("interpreted", "compiled")
 HOUSE, SLIPPERY = "Warehouse-v0", {"slip": 0.2, "random_start": True}
 IN_BINS = partial(
-    wrappers.DiscretizeObservation, bins=50, low=[-0.42, -0.87], high=[0.42, 0.87], dims=[2, 3]
+    wrap.DiscretizeObservation, bins=50, low=[-0.42, -0.87], high=[0.42, 0.87], dims=[2, 3]
 )
 SWING = {"low": [-2.4, -3, -0.21, -3], "high": [2.4, 3, 0.21, 3], "n_tiles": [2, 3, 6, 6]}
 KING = {"moves": "king", "stochastic": True, "max_episode_steps": 99}
@@ -50,7 +50,7 @@ TILED = [name for name, entry in ALGORITHMS.items() if entry.family == "linear"]
 
 
 def both_shaped(env):
-    return wrappers.TerminationReward(ClipReward(wrappers.ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
+    return wrap.TerminationReward(ClipReward(wrap.ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
 
 
 def rows():
@@ -62,7 +62,7 @@ def rows():
     for name in TILED:
         env_id, settings = trainings.AGENTS[name]
         yield f"{name} {env_id}", name, (env_id, {}), 2, settings
-    for wrapper in (both_shaped, wrappers.FlattenToDiscrete):
+    for wrapper in (both_shaped, wrap.FlattenToDiscrete):
         slippery = HOUSE, {**SLIPPERY, "wrapper": wrapper}
         yield f"under {wrapper.__name__}", "sarsa", slippery, 2, {"learning_rate": 0.3}
     yield "bins of CartPole", "qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, trainings.LESS
@@ -81,7 +81,7 @@ def rows():
     tiny = HOUSE, {"desc": ["S.", "#G"], "max_episode_steps": 5}
     noise = {**masked, **trainings.NOISE, "initial_q_std": 5.0}
     yield "noise masked", "sarsa", tiny, 1, noise
-    yield "masked", "dyna_q_plus", ("Taxi-v4", {"wrapper": wrappers.ActionMasks}), 2, masked
+    yield "masked", "dyna_q_plus", ("Taxi-v4", {"wrapper": wrap.ActionMasks}), 2, masked
 
 
 ROWS = {row[0]: row[1:] for row in rows()}

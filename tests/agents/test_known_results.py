@@ -104,11 +104,9 @@ COURSEWORK = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("learning_rate", "gamma", "epsilon", "early", "middle", "late"), COURSEWORK
-)
-def test_the_coursework_warehouse(learning_rate, gamma, epsilon, early, middle, late):
-    settings = {"learning_rate": learning_rate, "gamma": gamma, "exploration_initial_eps": epsilon}
+@pytest.mark.parametrize(("rate", "gamma", "epsilon", "early", "middle", "late"), COURSEWORK)
+def test_the_coursework_warehouse(rate, gamma, epsilon, early, middle, late):
+    settings = {"learning_rate": rate, "gamma": gamma, "exploration_initial_eps": epsilon}
     settings |= {"tie_breaking": "first", "env_kwargs": {"shelf_reward": -1}}
     runs = [returns_of("qlearning", "Warehouse-v0", s, 1000, **settings) for s in range(N_SEEDS)]
     returns = np.mean([returns for _, returns in runs], axis=0)

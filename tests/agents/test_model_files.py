@@ -91,11 +91,10 @@ def shown(value):
         numbers = [value.integers(2**32, dtype=np.uint32).item() for _ in range(2)]
         return numbers, value.standard_normal(8).tolist()
     if isinstance(value, gym.Space):
+        is_seeded = value._np_random is not None
         nested = [shown(part) for part in value.spaces.values()] if hasattr(value, "keys") else []
-        state = value._np_random and [
-            spaces.flatten(value, value.sample()).tolist() for _ in range(3)
-        ]
-        return repr(value), value.shape, value.dtype, nested, state
+        drawn = [spaces.flatten(value, value.sample()).tolist() for _ in range(3 * is_seeded)]
+        return repr(value), value.shape, value.dtype, nested, drawn
     says = [value(progress) for progress in (1.0, 0.6, 0.0)] if callable(value) else []
     return repr(value), says, getattr(value, "dtype", None)
 

@@ -273,9 +273,8 @@ def test_compiled_training_does_what_the_library_does_wherever_blocks_end(case):
     assert ours.exact == theirs.exact
     for each, other in zip(ours.close, theirs.close, strict=True):
         np.testing.assert_allclose(each, other, rtol=TOLERANCE, atol=TOLERANCE)
-    assert [(step, [*record]) for step, record in dumps] == [
-        (step, [*record]) for step, record in expected
-    ]
+    names, others = ([(step, [*record]) for step, record in each] for each in (dumps, expected))
+    assert names == others
     logged, other = (
         [v for _, record in each for v in record.values()] for each in (dumps, expected)
     )

@@ -193,13 +193,13 @@ MAZE = {"desc": ["S.#", "..G"], "step_reward": 0, "shelf_reward": 0, "goal_rewar
 
 
 @pytest.mark.parametrize(
-    ("name", "settings"), [("dyna_q", {}), ("prioritized_sweeping", {"threshold": 0.0})]
+    ("name", "own"), [("dyna_q", {}), ("prioritized_sweeping", {"threshold": 0})]
 )
-def test_much_planning_ends_in_the_optimum(name, settings):
+def test_much_planning_ends_in_the_optimum(name, own):
     """All pairs of a small maze were tried: their values are those of the best policy, exactly."""
     env = make_vec_env("Warehouse-v0", seed=0, env_kwargs=MAZE)
     uniform = {"exploration_decay": "constant", "exploration_initial_eps": 1.0}
-    settings = {"planning_steps": 50, "learning_rate": 1.0, **uniform, **settings}
+    settings = {"planning_steps": 50, "learning_rate": 1.0, **uniform, **own}
     agent = load_algorithm(name)(env=env, seed=0, gamma=0.9, **settings).learn(1500)
     model = transition_model(gym.make("Warehouse-v0", **MAZE))
     tried = agent.policy.model.counts > 0

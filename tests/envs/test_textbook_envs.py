@@ -208,9 +208,7 @@ N = 21
 
 
 def test_the_exercise_adds_a_free_move_and_fees_for_parking():
-    example, exercise = (
-        gym.make("JacksCarRental-v0", variant=variant) for variant in ("example", "exercise")
-    )
+    example, exercise = (gym.make("JacksCarRental-v0", variant=v) for v in ("example", "exercise"))
     one, two, moved = np.ogrid[:N, :N, -5:6]
     possible = (moved <= one) & (-moved <= two)
     left, right = np.minimum(one - moved, 20), np.minimum(two + moved, 20)
@@ -349,9 +347,8 @@ def test_the_tiger_is_heard_where_it_is_with_the_accuracy():
             np.testing.assert_allclose(chances("Tiger-v0", state, door), [0.5, 0, 0, 0.5, 0, 0])
     rewards = [[-1.0, -100.0, 10.0]] * 3 + [[-1.0, 10.0, -100.0]] * 3
     np.testing.assert_allclose(model.expected_reward, rewards)
-    assert mdp.finite_horizon_optimum(model, known.time_limit(env)).start_value == pytest.approx(
-        100
-    )
+    best = mdp.finite_horizon_optimum(model, known.time_limit(env)).start_value
+    assert best == pytest.approx(100)
 
 
 NORTH, EAST, SOUTH, WEST = range(4)

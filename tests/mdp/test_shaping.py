@@ -48,9 +48,8 @@ def test_a_bonus_for_stopping_by_hand(bonus, same, discounted, judged, factor):
 def shaped_by(model, potential, discount, factor=1.0):
     """The model with rewards times a factor, plus the difference of a potential."""
     after = np.where(model.terminated, 0.0, potential[model.next_state])
-    return replace(
-        model, reward=factor * model.reward + discount * after - potential[:, None, None]
-    )
+    shaped = factor * model.reward + discount * after - potential[:, None, None]
+    return replace(model, reward=shaped)
 
 
 def potentials(model):
