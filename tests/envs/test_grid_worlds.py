@@ -223,10 +223,8 @@ CHANGING = {"maze": "blocking", "changed": True}
 
 
 def test_shortest_ways_of_the_mazes():
-    found = [
-        DynaMazeEnv(maze=maze, changed=changed).shortest_path_length
-        for maze, changed in itertools.product(("blocking", "shortcut"), (False, True))
-    ]
+    mazes = itertools.product(("blocking", "shortcut"), (False, True))
+    found = [DynaMazeEnv(maze=m, changed=changed).shortest_path_length for m, changed in mazes]
     assert found == [10, 16, 16, 10]
     env = DynaMazeEnv()
     assert (env.shortest_path_length, env.transition_model().n_states) == (14, 54)

@@ -369,31 +369,23 @@ def places(cell, action, facing):
     return {key: pytest.approx(value) for key, value in found.items()}
 
 
-# Rows of the file hallway.POMDP, with its states written as cell and facing.
-@pytest.mark.parametrize(
-    ("cell", "facing", "expected"),
-    [
-        (0, EAST, {(1, EAST): 0.8, (0, EAST): 0.2}),
-        (2, EAST, {(3, EAST): 0.8, (11, SOUTH): 0.05, (1, EAST): 0.025, (1, WEST): 0.025,
-                   (2, EAST): 0.1}),
-        (2, NORTH, {(3, EAST): 0.05, (11, NORTH): 0.025, (11, SOUTH): 0.025, (1, WEST): 0.05,
-                    (2, NORTH): 0.85}),
-        (12, SOUTH, {(4, NORTH): 0.025, (4, SOUTH): 0.025, (12, SOUTH): 0.95}),
-    ],
-)  # fmt: skip
-def test_moving_forward_is_that_of_the_original(cell, facing, expected):
-    assert places(cell, FORWARD, facing) == expected
+TURNS = {RIGHT: (0.1, 0.7, 0.1, 0.1), AROUND: (0.1, 0.15, 0.6, 0.15), LEFT: (0.1, 0.1, 0.1, 0.7)}
+MOVES = [  # rows of the file hallway.POMDP, with its states written as cell and facing
+    (0, FORWARD, EAST, {(1, EAST): 0.8, (0, EAST): 0.2}),
+    (2, FORWARD, EAST, {(3, EAST): 0.8, (11, SOUTH): 0.05, (1, EAST): 0.025, (1, WEST): 0.025,
+                        (2, EAST): 0.1}),
+    (2, FORWARD, NORTH, {(3, EAST): 0.05, (11, NORTH): 0.025, (11, SOUTH): 0.025, (1, WEST): 0.05,
+                         (2, NORTH): 0.85}),
+    (12, FORWARD, SOUTH, {(4, NORTH): 0.025, (4, SOUTH): 0.025, (12, SOUTH): 0.95}),
+    *((5, STAY, facing, {(5, facing): 1}) for facing in range(4)),
+    *((5, action, facing, {(5, (facing + turn) % 4): by_turn[turn] for turn in range(4)})
+      for action, by_turn in TURNS.items() for facing in range(4)),
+]  # fmt: skip
 
 
-def test_turning_is_that_of_the_original():
-    for facing in range(4):
-        turned = [(5, (facing + turn) % 4) for turn in range(4)]
-        for action, by_turn in (
-            (RIGHT, (0.1, 0.7, 0.1, 0.1)), (AROUND, (0.1, 0.15, 0.6, 0.15)),
-            (LEFT, (0.1, 0.1, 0.1, 0.7)),
-        ):  # fmt: skip
-            assert places(5, action, facing) == dict(zip(turned, by_turn, strict=True))
-        assert places(5, STAY, facing) == {(5, facing): 1}
+@pytest.mark.parametrize(("cell", "action", "facing", "expected"), MOVES)
+def test_moves_in_the_hallway_are_those_of_the_original(cell, action, facing, expected):
+    assert places(cell, action, facing) == expected
 
 
 def test_readings_are_those_of_the_original():

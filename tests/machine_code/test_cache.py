@@ -58,14 +58,8 @@ def run(root, code):
     """The words that code prints which imports the copy."""
     variables = {**os.environ, "PYTHONPATH": str(root)}
     variables.pop("NUMBA_CACHE_DIR", None)
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=root,
-        env=variables,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command, told = [sys.executable, "-c", code], {"capture_output": True, "text": True}
+    done = subprocess.run(command, cwd=root, env=variables, check=False, **told)
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
 
@@ -100,14 +94,12 @@ USE = """
 import numpy as np
 from own_rules import Own
 from rl_yardstick.agents.common.algorithm import Transitions
-def q(cls):
-    # Not a whole training, whose other functions would be compiled too.
-    model = cls(env="FrozenLake-v1", learning_rate=1.0, gamma=1.0)
-    model._begin_episodes()
-    zero, no = np.array([0]), np.array([False])
-    model._learn_from(Transitions(zero, zero, np.zeros(1), no, no, zero))
-    return float(model.policy.q_table[0, 0])
-print(q(Own))
+# Not a whole training, whose other functions would be compiled too.
+model = Own(env="FrozenLake-v1", learning_rate=1.0, gamma=1.0)
+model._begin_episodes()
+zero, no = np.array([0]), np.array([False])
+model._learn_from(Transitions(zero, zero, np.zeros(1), no, no, zero))
+print(float(model.policy.q_table[0, 0]))
 """
 
 
