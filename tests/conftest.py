@@ -39,7 +39,7 @@ gc.disable()
 
 
 def pytest_collection_modifyitems(items):
-    """Mark the tests of daily work, which `tests/mutation` has chosen."""
+    """Mark the tests of daily work."""
     names = set((Path(__file__).parent / "quick.txt").read_text().split())
     for item in items:
         if item.nodeid.partition("[")[0] in names:

@@ -8,43 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-    CallbackList,
-    CheckpointCallback,
-    EvalCallback,
-    EveryNTimesteps,
-    LogEveryNTimesteps,
-    ProgressBarCallback,
-    StopTrainingOnMaxEpisodes,
-)
+from stable_baselines3.common import callbacks as sb3
 from stable_baselines3.common.logger import configure
 
-from rl_yardstick.agents.common.callbacks import (
-    BlockCallback,
-    Horizon,
-    calls_until_multiple,
-    members,
-)
+from rl_yardstick.agents.common.callbacks import BlockCallback, members
 from rl_yardstick.pipeline.callbacks import Checkpoint, EvaluationCallback
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.run import Run
 from rl_yardstick.pipeline.spec import TrainSpec
-from tests.agents.trainings import LAKE, environment, make, state_of
+from tests.agents.trainings import LAKE, Every, environment, make, state_of
 
 ENGINES = ("interpreted", "compiled")
 OF_THE_CLOCK = {"time/fps", "time/time_elapsed"}
 
 
-def without_clock(record):
-    return {key: value for key, value in record.items() if key not in OF_THE_CLOCK}
-
-
 def lake(engine="compiled", n_envs=1, name="qlearning", **kwargs):
     return make(name, environment(LAKE, n_envs, seed=0), seed=0, engine=engine, **kwargs)
-
-
-# --- every callback ------------------------------------------------------------------------------
 
 
 def snapshot(model):
@@ -52,7 +31,7 @@ def snapshot(model):
     return {key: value for key, value in state_of(model).items() if " of " not in key}
 
 
-class Recorder(BaseCallback):
+class Recorder(sb3.BaseCallback):
     """Notes what it sees whenever the callback that it is part of acts."""
 
     def __init__(self):
@@ -71,74 +50,51 @@ class Recorder(BaseCallback):
         return True
 
 
-class Watcher(BlockCallback):
-    """Acts on every fortieth call."""
-
-    def __init__(self):
-        super().__init__()
-        self.seen = []
-
-    def horizon(self):
-        return Horizon(calls=calls_until_multiple(self.n_calls, 40))
-
-    def _on_step(self):
-        if self.n_calls % 40 == 0:
-            self.seen.append((self.num_timesteps, self.locals["new_obs"].tolist()))
-        return True
-
-
-def every_kind(folder, evaluated):
-    """One callback of every kind that the compiled engine knows."""
-    env = environment(LAKE, 1, seed=9)
-
-    def evaluator(model):
-        evaluated.append(snapshot(model))
-        return Evaluation(np.array([float(len(evaluated))]), np.array([1]), None)
-
-    run = Run.claim(folder / "logs", TrainSpec(algo="sarsa", env_id=LAKE, n_timesteps=1))
-    steps, episodes = ({"save_path": str(folder / name)} for name in ("steps", "episodes"))
-    for kwargs in (steps, episodes):
-        Path(kwargs["save_path"]).mkdir(parents=True)
-    return [
-        EvalCallback(env, eval_freq=90, n_eval_episodes=2, log_path=str(folder), verbose=0),
-        CheckpointCallback(110, str(folder), name_prefix="library"),
-        EveryNTimesteps(70, Recorder()),
-        LogEveryNTimesteps(130),
-        EvaluationCallback(run, env, evaluator, (55, 0)),
-        Checkpoint(85, **steps),
-        Checkpoint(every_n_episodes=9, **episodes),
-        ProgressBarCallback(),
-        CallbackList([Watcher(), StopTrainingOnMaxEpisodes(60)]),
-    ]
-
-
 def saved(path):
     """What a checkpoint holds, but for the name of the engine and the times."""
     with zipfile.ZipFile(path) as archive:
         data = json.loads(archive.read("data"))
         assert archive.read("policy.pth")
-    for name in ("engine", "engine_in_use", "ep_info_buffer"):
-        data.pop(name)
-    return data
+    return {key: data[key] for key in data.keys() - {"engine", "engine_in_use", "ep_info_buffer"}}
 
 
 def trained(engine, folder):
-    """Everything that happened in a training with all callbacks."""
-    model, evaluated = lake(engine, 3, "sarsa", exploration_final_eps=0.3), []
-    callbacks = every_kind(folder, evaluated)
+    """Everything that happened in a training with all callbacks that the compiled engine knows."""
+    model, evaluated, watched = lake(engine, 3, "sarsa", exploration_final_eps=0.3), [], []
+
+    def evaluator(model):
+        evaluated.append(snapshot(model))
+        return Evaluation(np.array([float(len(evaluated))]), np.array([1]), None)
+
+    env, watcher = environment(LAKE, 1, seed=9), Every(40, lambda m: watched.append(snapshot(m)))
+    run = Run.claim(folder / "logs", TrainSpec(algo="sarsa", env_id=LAKE, n_timesteps=1))
+    steps, episodes = ({"save_path": str(folder / name)} for name in ("steps", "episodes"))
+    for kwargs in (steps, episodes):
+        Path(kwargs["save_path"]).mkdir(parents=True)
+    callbacks = [
+        sb3.EvalCallback(env, eval_freq=90, n_eval_episodes=2, log_path=str(folder), verbose=0),
+        sb3.CheckpointCallback(110, str(folder), name_prefix="library"),
+        sb3.EveryNTimesteps(70, recorder := Recorder()),
+        sb3.LogEveryNTimesteps(130),
+        EvaluationCallback(run, env, evaluator, (55, 0)),
+        Checkpoint(85, **steps),
+        Checkpoint(every_n_episodes=9, **episodes),
+        bar := sb3.ProgressBarCallback(),
+        sb3.CallbackList([watcher, sb3.StopTrainingOnMaxEpisodes(60)]),
+    ]
     model.learn(2000, callback=callbacks, log_interval=11)
     assert model.engine_in_use.startswith(engine)
     evaluations = np.load(folder / "evaluations.npz")
     everyone = [member for callback in callbacks for member in members(callback)]
     return {
         "evaluated": evaluated,
-        "recorded": callbacks[2].callback.seen,
-        "watched": callbacks[-1].callbacks[0].seen,
+        "recorded": recorder.seen,
+        "watched": watched,
         "evaluations": evaluations["timesteps"].tolist(),
         "results": evaluations["results"].tolist(),
         "files": {str(p.relative_to(folder)): saved(p) for p in folder.rglob("*_steps.zip")},
         "calls": [(type(each).__name__, each.n_calls, each.num_timesteps) for each in everyone],
-        "bar": callbacks[-2].pbar.n,
+        "bar": bar.pbar.n,
         "steps": model.num_timesteps,
     }
 
@@ -155,9 +111,6 @@ def test_every_callback_at_the_same_steps(tmp_path):
         assert len(interpreted[name]) >= 3, name
     folders = {"/".join(name.split("/")[:-1][:1]) for name in interpreted["files"]}
     assert folders == {"", "steps", "episodes"}
-
-
-# --- when callbacks act --------------------------------------------------------------------------
 
 
 class Sparse(BlockCallback):
@@ -183,24 +136,20 @@ def test_a_sparse_callback_can_stop_the_training():
     assert callback.seen == [20, 40, 60]
 
 
-# --- logs ----------------------------------------------------------------------------------------
-
-
 def test_a_compiled_training_logs_once_per_block(tmp_path):
     """What it logs is what an interpreted agent comes to after as many steps."""
     settings = {"exploration_decay": "constant", "exploration_initial_eps": 0.3}
     settings |= {"stats_window_size": 5, "n_envs": 2, "name": "sarsa"}
-    model, found = lake(**settings), []
+    model, other = lake(**settings), lake("interpreted", **settings)
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(2000, Sparse(500), log_interval=5)
     model.logger.close()
-    with (tmp_path / "progress.csv").open() as file:
-        rows = [without_clock(row) for row in csv.DictReader(file)]
-    other = lake("interpreted", **settings)
-    for _ in rows:
+    rows = [*csv.DictReader((tmp_path / "progress.csv").read_text().splitlines())]
+    assert len(rows) == 4
+    for row in rows:
         other.learn(500, log_interval=None, reset_num_timesteps=False)
         returns, lengths = zip(*((e["r"], e["l"]) for e in other.ep_info_buffer), strict=True)
-        expected = {
+        assert {k: float(v) for k, v in row.items() if k not in OF_THE_CLOCK} == {
             "rollout/ep_rew_mean": np.mean(returns),
             "rollout/ep_len_mean": np.mean(lengths),
             "rollout/exploration_rate": 0.3,
@@ -210,8 +159,3 @@ def test_a_compiled_training_logs_once_per_block(tmp_path):
             "train/mean_absolute_td_error": other.mean_td_error,
             "train/n_updates": other._n_updates,
         }
-        found.append({name: str(value) for name, value in expected.items()})
-    assert [{k: float(v) for k, v in row.items()} for row in rows] == [
-        {k: float(v) for k, v in row.items()} for row in found
-    ]
-    assert len(rows) == 4

@@ -11,11 +11,19 @@ import numpy as np
 import pytest
 import stable_baselines3
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from rl_yardstick.agents.common.model_files import JsonAlgorithm
-from tests.agents.trainings import AGENTS, LAKE, LATE, SEGMENTS, assert_same, environment, state_of
+from tests.agents.trainings import (
+    AGENTS,
+    LAKE,
+    LATE,
+    SEGMENTS,
+    Plain,
+    assert_same,
+    environment,
+    state_of,
+)
 from tests.agents.trainings import make as make_in
 
 PLANNING = {"value_iteration", "policy_iteration", "optimal"}
@@ -41,14 +49,6 @@ def steady(name):
     constants = {key: 0.3 for key, value in settings.items() if callable(value)}
     decay = {"exploration_decay": "constant"} if "exploration_decay" in settings else {}
     return {**constants, **decay}
-
-
-class CountDones(BaseCallback):
-    n_done = 0
-
-    def _on_step(self):
-        self.n_done += int(self.locals["dones"].sum())
-        return True
 
 
 @cache
@@ -81,7 +81,7 @@ def test_seeds_decide_calls_do_not_and_everything_is_counted(name):
     def of_all():
         return np.random.get_state()[1].tolist(), th.get_rng_state().tolist()  # noqa: NPY002
 
-    before, model, counter = of_all(), make(name, **steady(name)), CountDones()
+    before, model, counter = of_all(), make(name, **steady(name)), Plain()
     assert model.learn(39, callback=counter) is model
     assert model.num_timesteps == 40
     model.learn(80, callback=counter, reset_num_timesteps=False)
@@ -91,9 +91,10 @@ def test_seeds_decide_calls_do_not_and_everything_is_counted(name):
     assert_same(whole, again)
     assert of_all() == before
     assert model.num_timesteps == 120 == counter.n_calls * 2
-    assert model._episode_num == counter.n_done
+    assert model._episode_num == sum(counter.ended)
     assert model._n_updates == trained(name)._n_updates
-    assert counter.n_done > 0 or ALGORITHMS[name].for_bandits or AGENTS[name][0] == "MountainCar-v0"
+    endless = ALGORITHMS[name].for_bandits or AGENTS[name][0] == "MountainCar-v0"
+    assert sum(counter.ended) > 0 or endless
     other = state_of(make(name, seed=2, **steady(name)).learn(120))
     assert other["generator"] != again["generator"] or name in {*PLANNING, "angle"}
     tables = {key for key in other if "." not in key} & {"scores", "sums", "coefficients"}
@@ -155,9 +156,6 @@ def test_predict_takes_one_observation_or_many_and_arguments_have_names(name):
         make(name, nonsense=1)
 
 
-# --- the library's services ----------------------------------------------------------------------
-
-
 def test_a_loaded_agent_can_go_on_in_an_episode(tmp_path):
     for name in ("sarsa", "monte_carlo", "reinforce"):
         env = environment(LAKE, 2)
@@ -166,9 +164,6 @@ def test_a_loaded_agent_can_go_on_in_an_episode(tmp_path):
         loaded = type(model).load(tmp_path / "model", env, force_reset=False)
         assert loaded._last_obs.tolist() == model._last_obs.tolist()
         assert loaded.learn(50, reset_num_timesteps=False).num_timesteps == 100
-
-
-# --- what files keep -----------------------------------------------------------------------------
 
 
 def test_files_of_other_agents_are_refused(tmp_path):

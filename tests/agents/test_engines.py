@@ -4,43 +4,35 @@ import copy
 import itertools
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from gymnasium.wrappers import ClipReward, TimeLimit
+from stable_baselines3.common.callbacks import (
+    CallbackList,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from rl_yardstick.agents import ALGORITHMS
-from rl_yardstick.agents.common.callbacks import (
-    BlockCallback,
-    EpisodeBudget,
-    Horizon,
-    calls_until_multiple,
-)
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
+from rl_yardstick.agents.common.callbacks import EpisodeBudget
+from rl_yardstick.envs import checking as model_checks
+from rl_yardstick.envs import wrappers as wrap
 from rl_yardstick.envs.grid import Tile
-from rl_yardstick.envs.wrappers import (
-    ActionMasks,
-    DiscretizeObservation,
-    FlattenToDiscrete,
-    ScaleReward,
-    TerminationReward,
-)
-from tests.agents.trainings import (
-    AGENTS,
-    CONSTANT,
-    LAKE,
-    LESS,
-    NOISE,
-    assert_same,
-    environment,
-    make,
-    state_of,
-)
+from rl_yardstick.envs.known_models import transition_model
+from tests.agents import trainings
+from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 
-ENGINES = ("interpreted", "compiled")
+LAKE, ENGINES = trainings.LAKE, ("interpreted", "compiled")
 HOUSE, SLIPPERY = "Warehouse-v0", {"slip": 0.2, "random_start": True}
 IN_BINS = partial(
-    DiscretizeObservation, bins=50, low=[-0.42, -0.87], high=[0.42, 0.87], dims=[2, 3]
+    wrap.DiscretizeObservation, bins=50, low=[-0.42, -0.87], high=[0.42, 0.87], dims=[2, 3]
 )
 SWING = {"low": [-2.4, -3, -0.21, -3], "high": [2.4, 3, 0.21, 3], "n_tiles": [2, 3, 6, 6]}
 KING = {"moves": "king", "stochastic": True, "max_episode_steps": 99}
@@ -58,7 +50,7 @@ TILED = [name for name, entry in ALGORITHMS.items() if entry.family == "linear"]
 
 
 def both_shaped(env):
-    return TerminationReward(ClipReward(ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
+    return wrap.TerminationReward(ClipReward(wrap.ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
 
 
 def rows():
@@ -66,24 +58,30 @@ def rows():
     numbers, places = itertools.cycle((1, 3, 8)), itertools.cycle(WORLDS)
     for name in TABULAR:
         place = next(places)
-        yield f"{name} {place}", name, WORLDS[place], next(numbers), AGENTS[name][1]
+        yield f"{name} {place}", name, WORLDS[place], next(numbers), trainings.AGENTS[name][1]
     for name in TILED:
-        env_id, settings = AGENTS[name]
+        env_id, settings = trainings.AGENTS[name]
         yield f"{name} {env_id}", name, (env_id, {}), 2, settings
-    for wrapper in (both_shaped, FlattenToDiscrete):
+    for wrapper in (both_shaped, wrap.FlattenToDiscrete):
         slippery = HOUSE, {**SLIPPERY, "wrapper": wrapper}
         yield f"under {wrapper.__name__}", "sarsa", slippery, 2, {"learning_rate": 0.3}
-    yield "bins of CartPole", "qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, LESS
-    yield "tiles of CartPole", "semi_gradient_q", ("CartPole-v1", {}), 1, {**SWING, **LESS}
+    yield "bins of CartPole", "qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, trainings.LESS
+    yield (
+        "tiles of CartPole",
+        "semi_gradient_q",
+        ("CartPole-v1", {}),
+        1,
+        {**SWING, **trainings.LESS},
+    )
     # Episodes of 82 steps, more than there is room for at first.
     left_at_first = {"initial_preferences": [1.47, -1.47], "learning_rate": 0.002}
     yield "reinforce", "reinforce", ("ShortCorridor-v0", {}), 2, left_at_first
     # That all agents keep to masks is seen in test_masks.py, where steps are interpreted.
     masked = {"mask_actions": True}
     tiny = HOUSE, {"desc": ["S.", "#G"], "max_episode_steps": 5}
-    noise = {**masked, **NOISE, "initial_q_std": 5.0}
+    noise = {**masked, **trainings.NOISE, "initial_q_std": 5.0}
     yield "noise masked", "sarsa", tiny, 1, noise
-    yield "masked", "dyna_q_plus", ("Taxi-v4", {"wrapper": ActionMasks}), 2, masked
+    yield "masked", "dyna_q_plus", ("Taxi-v4", {"wrapper": wrap.ActionMasks}), 2, masked
 
 
 ROWS = {row[0]: row[1:] for row in rows()}
@@ -91,7 +89,9 @@ ROWS = {row[0]: row[1:] for row in rows()}
 
 def in_world(name, place, n_envs=1, folder=None, **settings):
     env_id, kwargs = place
-    return make(name, environment(env_id, n_envs, folder=folder, **kwargs), **settings)
+    return trainings.make(
+        name, trainings.environment(env_id, n_envs, folder=folder, **kwargs), **settings
+    )
 
 
 def assert_engines_agree(make_model, train):
@@ -101,7 +101,7 @@ def assert_engines_agree(make_model, train):
         models.append(make_model(engine=engine))
         train(models[-1])
         assert models[-1].engine_in_use.startswith(engine)
-    assert_same(*map(state_of, models))
+    trainings.assert_same(*map(trainings.state_of, models))
     return models
 
 
@@ -119,8 +119,8 @@ def test_same_bits_also_where_engines_take_turns(row, tmp_path):
         model.env.close()
         lines = [path.read_text().splitlines()[1:] for path in sorted(folder.glob("*.csv"))]
         written = [[line.split(",")[:2] for line in each] for each in lines]
-        states.append({**state_of(model), "rows": written})
-    assert_same(*states)
+        states.append({**trainings.state_of(model), "rows": written})
+    trainings.assert_same(*states)
     assert states[0]["rows"][0][0] == ["r", "l"]
     table = getattr(model.policy, "q_tables", None)
     changed = model.policy.weights if table is None else model.policy.visit_counts
@@ -155,25 +155,6 @@ def test_schedules_by_episodes():
     assert models[0]._current_progress_remaining == pytest.approx(0.0, abs=0.01)
 
 
-# --- changes in the middle of a training ---------------------------------------------------------
-
-
-class Change(BlockCallback):
-    """Does something to the agent on a call."""
-
-    def __init__(self, change):
-        super().__init__()
-        self.change = change
-
-    def horizon(self):
-        return Horizon(calls=calls_until_multiple(self.n_calls, 500))
-
-    def _on_step(self):
-        if self.n_calls == 500:
-            self.change(self.model)
-        return True
-
-
 def put(**attributes):
     def change(model):
         for name, value in attributes.items():
@@ -198,8 +179,9 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", CHANGES)
 def test_a_change_counts_in_both_loops(what):
-    start = {"initial_q": 0.5 * what.startswith("zeros"), **CONSTANT}
-    lake, change = partial(in_world, "sarsa", WORLDS["lake"], **start), Change(CHANGES[what])
+    start = {"initial_q": 0.5 * what.startswith("zeros"), **trainings.CONSTANT}
+    lake = partial(in_world, "sarsa", WORLDS["lake"], **start)
+    change = trainings.Every(501, CHANGES[what])
     models = assert_engines_agree(lake, lambda m: m.learn(1000, callback=copy.copy(change)))
     unchanged = lake().learn(1000)
     assert not np.array_equal(models[0].policy.q_tables, unchanged.policy.q_tables)
@@ -242,3 +224,143 @@ def test_a_change_of_the_environment_by_hand_counts_and_for_it_alone(what):
     alone = lasting().learn(300).learn(700, reset_num_timesteps=False)
     states = [model.policy.state_dict().values() for model in (changed, alone)]
     assert not all(map(th.equal, *states))
+
+
+class Foreign(gym.Wrapper):
+    """Nobody knows what it does."""
+
+
+def lake(**kwargs):
+    return make_vec_env("FrozenLake-v1", 1, seed=0, **kwargs)
+
+
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch):
+    """Checks of a model take many steps, and are kept."""
+    monkeypatch.setattr(model_checks, "N_STEPS", 5_000)
+    monkeypatch.setattr(model_checks, "_checks", {})
+
+
+def calm():
+    """A corridor that tells of no wind, though it blows."""
+    return TimeLimit(Corridor(outcomes(wind=0.0)), 10)
+
+
+INTERPRETED = {  # reason: environment, settings, callback
+    "VecNormalize is not DummyVecEnv": (lambda: VecNormalize(lake(), norm_obs=False),),
+    "the environment's transition model is not known": (partial(lake, wrapper_class=Foreign),),
+    "rewards are drawn, and the environment's model": (partial(gym.make, "MaximizationBias-v0"),),
+    "the environments are not alike": (
+        lambda: DummyVecEnv([lambda: gym.make(LAKE), lambda: gym.make(LAKE, is_slippery=False)]),),
+    "the environment is shown on the screen": (partial(lake, env_kwargs={"render_mode": "human"}),),
+    "a time limit lies outside Monitor": (
+        partial(lake, wrapper_class=partial(TimeLimit, max_episode_steps=9)),),
+    "under DiscretizeObservation and Monitor alone": (
+        lambda: IN_BINS(gym.wrappers.Autoreset(gym.make("CartPole-v1"))),),
+    "does not continue from the state": (lambda: TimeLimit(Deaf(), 10),),
+    "the environment's P is not what step does: state ": (calm,),
+    "schedule is a Python function": (lake, {"learning_rate": lambda progress: 0.1 * progress}),
+    "ConvertCallback must be asked after each step": (lake, {}, lambda: lambda local, _: True),
+    "Plain must be asked after each step$": (
+        lake, {}, lambda: [CallbackList([trainings.Plain()]), StopTrainingOnMaxEpisodes(5)]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("reason", INTERPRETED)
+def test_what_is_interpreted_and_why(reason):
+    make_env, *rest = INTERPRETED[reason]
+    settings, callback = (*rest, *({}, None)[len(rest) :])
+    env, callback = make_env(), callback and callback()
+    model = load_algorithm("qlearning")(env=env, engine="compiled", seed=0, **settings)
+    with pytest.raises(ValueError, match=f"engine: compiled is not possible: .*{reason}"):
+        model.learn(2, callback=callback)
+    model.engine = "auto"
+    model.learn(2, callback=callback)
+    assert model.engine_in_use.startswith("interpreted: ")
+    env.close()
+
+
+def test_the_engine_that_was_asked_for():
+    model = load_algorithm("qlearning")(env="FrozenLake-v1")
+    in_use = []
+    for engine in ("interpreted", "auto", "compiled"):
+        model.engine = engine
+        in_use.append(model.learn(10).engine_in_use)
+    assert in_use == ["interpreted: asked for", "compiled", "compiled"]
+    plain = trainings.Plain()
+    model.learn(1_000, callback=EveryNTimesteps(100, plain))
+    assert (model.engine_in_use, plain.n_calls) == ("compiled", 10)
+
+
+def played(kind, engine, **settings):
+    env = TimeLimit(kind(), 50)
+    uniform = {"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0}
+    model = load_algorithm("qlearning")(env=env, engine=engine, seed=4, **uniform, **settings)
+    return model.learn(8_000)
+
+
+def test_an_environment_of_ones_own_ends_in_the_same_bits_if_it_draws_as_toy_text_does():
+    models = [played(Corridor, engine) for engine in ("interpreted", "auto")]
+    assert models[1].engine_in_use == "compiled"
+    np.testing.assert_array_equal(*(model.policy.q_table for model in models))
+    words = {
+        "auto": "interpreted: the environment draws in its own way, so that compiled training is "
+        "equal in distribution only (engine: compiled takes that)",
+        "compiled": "compiled, not bit for bit: the environment draws in its own way",
+    }
+    tables, expected = [], transition_model(Backwards()).expected_reward
+    for engine, said in words.items():
+        model = played(Backwards, engine, gamma=0.0, learning_rate="sample_average")
+        assert model.engine_in_use == said
+        tables.append(np.asarray(model.policy.q_table))
+        # With averages and no discount each value is the mean of the pair's rewards, which are -1
+        # but for the goal's 9, with a chance of 0.7: five standard errors.
+        n = np.maximum(model.policy.visit_counts.numpy()[0], 1)
+        spread = np.where(expected == -1, 0, 10 * np.sqrt(0.7 * 0.3 / n))
+        visited = model.policy.visit_counts.numpy()[0] > 50
+        assert visited[:4].all()
+        assert (np.abs(tables[-1] - expected) <= 5 * spread + 1e-9)[visited].all()
+    assert not np.array_equal(*tables)
+    with pytest.raises(ValueError, match="whose transition model is known: the environment's P is"):
+        load_algorithm("value_iteration")(env=calm()).learn(10)
+
+
+class Liar(gym.Env):
+    """Shows what is not in its space, at the start or after a step."""
+
+    observation_space, action_space = spaces.Discrete(4), spaces.Discrete(2)
+
+    def __init__(self, at_start=0, after_step=0):
+        self.at_start, self.after_step = at_start, after_step
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.at_start, {}
+
+    def step(self, action):
+        return self.after_step, 1.0, False, False, {}
+
+
+@pytest.mark.parametrize("name", ["qlearning", "epsilon_greedy"])
+def test_an_observation_outside_of_the_space_is_refused(name):
+    """Compiled code would read and write beside the table."""
+    for outside in (4, 10**9, -1):
+        for shown in ((outside, 0), (0, outside)):
+            model = load_algorithm(name)(env=Liar(*shown), seed=0)
+            with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
+                model.learn(5)
+
+
+def test_what_python_does_instead_is_not_compiled_away():
+    class OwnLearning(load_algorithm("qlearning")):
+        def _learn_from(self, transitions):
+            pass
+
+    model = OwnLearning(env="FrozenLake-v1", seed=0).learn(0)
+    reason = "OwnLearning has a _learn_from of its own in Python"
+    assert model.engine_in_use == f"interpreted: {reason}"
+    with pytest.raises(TypeError, match=r"Plain.next_value is called by compiled code: put @inl"):
+
+        class Plain(load_algorithm("qlearning")):
+            def next_value(agent, env, progress, table):  # noqa: N805
+                return 0.0

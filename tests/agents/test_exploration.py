@@ -11,17 +11,7 @@ from hypothesis.extra.numpy import arrays
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from rl_yardstick.agents import load_algorithm
-from rl_yardstick.agents.common.exploration import (
-    BOLTZMANN,
-    EPSILON_GREEDY,
-    action_probabilities,
-    action_probability,
-    boltzmann_action,
-    epsilon_greedy_action,
-    expected_value,
-    greedy_action,
-    noisy_greedy_action,
-)
+from rl_yardstick.agents.common import exploration as explore
 from rl_yardstick.agents.common.schedules import ExponentialSchedule, schedule_row, schedule_value
 from tests.agents.hand_fed import Spaces
 
@@ -30,48 +20,54 @@ VALUES = np.array([1.0, 3.0, 3.0, 2.0])
 
 def test_choices_by_given_numbers():
     # Ties share the unit interval.
-    assert [greedy_action(VALUES, u) for u in (0.0, 0.49, 0.5, 0.99)] == [1, 1, 2, 2]
+    assert [explore.greedy_action(VALUES, u) for u in (0.0, 0.49, 0.5, 0.99)] == [1, 1, 2, 2]
     # Below epsilon it explores; a tie scale of 0 takes the first of the best.
     draws = np.array([[0.29, 0.0], [0.29, 0.99], [0.3, 0.0], [0.3, 0.99]])
-    assert [epsilon_greedy_action(VALUES, 0.3, 1.0, row) for row in draws] == [0, 3, 1, 2]
-    assert epsilon_greedy_action(VALUES, 0.3, 0.0, np.array([0.9, 0.99])) == 1
+    assert [explore.epsilon_greedy_action(VALUES, 0.3, 1.0, row) for row in draws] == [0, 3, 1, 2]
+    assert explore.epsilon_greedy_action(VALUES, 0.3, 0.0, np.array([0.9, 0.99])) == 1
     # The cumulative probabilities are inverted, and do not overflow.
     values = np.log([1.0, 2.0, 5.0])
-    chosen = [boltzmann_action(values, 1.0, np.array([u])) for u in (0.0, 0.12, 0.13, 0.37, 0.38)]
+    chosen = [
+        explore.boltzmann_action(values, 1.0, np.array([u])) for u in (0.0, 0.12, 0.13, 0.37, 0.38)
+    ]
     assert chosen == [0, 0, 1, 1, 2]
-    assert boltzmann_action(np.array([1e6, 0.0]), 1e-3, np.array([0.999])) == 0
+    assert explore.boltzmann_action(np.array([1e6, 0.0]), 1e-3, np.array([0.999])) == 0
     # Noise is added to the values.
     draws = np.array([0.0, -1.0, 0.0, 1.5])
-    assert [noisy_greedy_action(VALUES, scale, draws) for scale in (1.0, 0.1)] == [3, 2]
+    assert [explore.noisy_greedy_action(VALUES, scale, draws) for scale in (1.0, 0.1)] == [3, 2]
 
 
 def test_a_temperature_that_has_fallen_to_0_is_the_limit():
     values, expected = np.array([1.0, 3.0, 3.0, 0.0]), [0.0, 0.5, 0.5, 0.0]
-    chosen = [boltzmann_action(values, 0.0, np.array([u])) for u in (0.0, 0.49, 0.51, 0.99)]
+    chosen = [explore.boltzmann_action(values, 0.0, np.array([u])) for u in (0.0, 0.49, 0.51, 0.99)]
     assert chosen == [1, 1, 2, 2]
-    found = [action_probability(BOLTZMANN, values, 0.0, 1.0, action) for action in range(4)]
-    matrix = action_probabilities(BOLTZMANN, values[None], 0.0, random_ties=True)
+    found = [
+        explore.action_probability(explore.BOLTZMANN, values, 0.0, 1.0, action)
+        for action in range(4)
+    ]
+    matrix = explore.action_probabilities(explore.BOLTZMANN, values[None], 0.0, random_ties=True)
     assert found == matrix[0].tolist() == expected
-    assert expected_value(BOLTZMANN, values, 0.0) == 3.0
+    assert explore.expected_value(explore.BOLTZMANN, values, 0.0) == 3.0
 
 
 @given(
     arrays(np.float64, st.integers(1, 6), elements=st.floats(-50, 50, allow_subnormal=False)),
     st.floats(0.05, 1),
-    st.sampled_from([EPSILON_GREEDY, BOLTZMANN]),
+    st.sampled_from([explore.EPSILON_GREEDY, explore.BOLTZMANN]),
     st.booleans(),
 )
 def test_expected_value_is_the_mean_under_the_probabilities(values, rate, strategy, random_ties):
-    probabilities = action_probabilities(strategy, values[None], rate, random_ties=random_ties)[0]
+    probabilities = explore.action_probabilities(
+        strategy, values[None], rate, random_ties=random_ties
+    )[0]
     assert probabilities.sum() == pytest.approx(1)
     mean = float(probabilities @ values)
-    assert expected_value(strategy, values, rate) == pytest.approx(mean, rel=1e-9, abs=1e-9)
+    assert explore.expected_value(strategy, values, rate) == pytest.approx(mean, rel=1e-9, abs=1e-9)
     ties = float(random_ties)
-    found = [action_probability(strategy, values, rate, ties, a) for a in range(len(values))]
+    found = [
+        explore.action_probability(strategy, values, rate, ties, a) for a in range(len(values))
+    ]
     np.testing.assert_allclose(found, probabilities, rtol=1e-12, atol=1e-15)
-
-
-# --- what agents would do, row by row -------------------------------------------------------------
 
 
 def agent_of(values, **arguments):
@@ -135,8 +131,6 @@ def test_how_much_agents_explore(arguments, rates):
     is_noise = "noise_std" in arguments
     assert model.exploration_rate == pytest.approx(rates[-1] / (4 if is_noise else 1))
 
-
-# --- schedules ------------------------------------------------------------------------------------
 
 # Training may run past its end, by a rollout or an episode.
 progress = st.floats(-0.5, 1)

@@ -11,16 +11,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick import mdp
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.envs.known_models import time_limit, transition_model
-from rl_yardstick.mdp import (
-    TransitionModel,
-    finite_horizon_optimum,
-    policy_iteration,
-    policy_return,
-    value_iteration,
-)
 
 N_SEEDS = 10
 
@@ -30,20 +24,17 @@ def made(name, env_id, seed=0, n_envs=1, env_kwargs=None, **settings):
     return load_algorithm(name)(env=env, seed=seed, **settings)
 
 
-# --- planning ------------------------------------------------------------------------------------
-
-
 def test_policy_iteration_by_hand():
     """To stay in state 0 earns 1, in state 1 it earns 3; to go over earns nothing."""
     next_state = np.array([[[0], [1]], [[1], [1]]])
-    model = TransitionModel(
+    model = mdp.TransitionModel(
         prob=np.ones(next_state.shape),
         next_state=next_state,
         reward=np.array([[[1.0], [0.0]], [[3.0], [3.0]]]),
         terminated=np.zeros(next_state.shape, dtype=bool),
         initial=np.array([1.0, 0.0]),
     )
-    plan = policy_iteration(model, 0.5)
+    plan = mdp.policy_iteration(model, 0.5)
     assert plan.values == pytest.approx([3, 6])
     assert plan.action_values[0] == pytest.approx([2.5, 3])
     assert (plan.policy[0], plan.iterations) == (1, 2)
@@ -51,7 +42,7 @@ def test_policy_iteration_by_hand():
 
 def test_the_optimal_agent_keeps_the_time_of_each_episode_apart():
     agent = made("optimal", "FrozenLake-v1").learn(1)
-    plan = finite_horizon_optimum(transition_model(gym.make("FrozenLake-v1")), 100)
+    plan = mdp.finite_horizon_optimum(transition_model(gym.make("FrozenLake-v1")), 100)
     # A state whose best action changes towards the end of the time.
     changing = np.flatnonzero((plan.policy != plan.policy[0]).any(axis=0))[0]
     state = None
@@ -73,9 +64,6 @@ def test_plans_need_a_model_and_the_optimum_a_time_limit():
         load_algorithm("optimal")(env=gym.make("CliffWalking-v1")).learn(1)
 
 
-# --- learning ------------------------------------------------------------------------------------
-
-
 def returns_of(name, env_id, seed, n_episodes, env_kwargs=None, **settings):
     """The agent after ``n_episodes``, and the return of each of them."""
     agent = made(name, env_id, seed, 1, env_kwargs, exploration_decay="constant", **settings)
@@ -88,8 +76,8 @@ def worth(agent, env_id, kwargs, horizon=None):
     env = gym.make(env_id, **kwargs)
     model, horizon = transition_model(env), horizon or time_limit(env)
     policy = agent.predict(np.arange(model.n_states), deterministic=True)[0]
-    optimum = finite_horizon_optimum(model, horizon).start_value
-    return policy_return(model, policy, horizon).expected_return, optimum
+    optimum = mdp.finite_horizon_optimum(model, horizon).start_value
+    return mdp.policy_return(model, policy, horizon).expected_return, optimum
 
 
 def test_cliff_walking_as_in_the_book():
@@ -116,11 +104,9 @@ COURSEWORK = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("learning_rate", "gamma", "epsilon", "early", "middle", "late"), COURSEWORK
-)
-def test_the_coursework_warehouse(learning_rate, gamma, epsilon, early, middle, late):
-    settings = {"learning_rate": learning_rate, "gamma": gamma, "exploration_initial_eps": epsilon}
+@pytest.mark.parametrize(("rate", "gamma", "epsilon", "early", "middle", "late"), COURSEWORK)
+def test_the_coursework_warehouse(rate, gamma, epsilon, early, middle, late):
+    settings = {"learning_rate": rate, "gamma": gamma, "exploration_initial_eps": epsilon}
     settings |= {"tie_breaking": "first", "env_kwargs": {"shelf_reward": -1}}
     runs = [returns_of("qlearning", "Warehouse-v0", s, 1000, **settings) for s in range(N_SEEDS)]
     returns = np.mean([returns for _, returns in runs], axis=0)
@@ -153,9 +139,11 @@ def test_one_try_is_enough_where_nothing_is_random(env_id):
     best; an episode that meets nothing new is therefore as good as the best one.
     """
     model = transition_model(gym.make(env_id))
-    plan = value_iteration(model, 0.99)
+    plan = mdp.value_iteration(model, 0.99)
     bound = max(float(plan.values[model.reachable].max()), 0.0)
     agent = made("r_max", env_id, known_after=1, value_bound=bound, tolerance=1e-9)
     agent.learn(int(model.reachable.sum()) * model.n_actions * 20)
     greedy = np.eye(model.n_actions, dtype=bool)[agent.policy.q_table.argmax(axis=1)]
-    assert value_iteration(model, 0.99, mask=greedy).start_value == pytest.approx(plan.start_value)
+    assert mdp.value_iteration(model, 0.99, mask=greedy).start_value == pytest.approx(
+        plan.start_value
+    )

@@ -1,6 +1,8 @@
 """Agents on the library's classes, by hand and against it; and the two that do not learn."""
 
 import itertools
+import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -9,18 +11,21 @@ import sb3_contrib
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
+from rl_yardstick.agents.common.schedules import ExponentialSchedule, library_schedule
 from rl_yardstick.agents.library import DeepQLearning, DoubleDQN, double_q_values
 from rl_yardstick.agents.random_search import ARS
 from rl_yardstick.agents.reference import AngleAgent, RandomAgent
-
-# --- deep Q-learning -----------------------------------------------------------------------------
+from rl_yardstick.envs.wrappers import ActionMasks
+from tests.agents.trainings import Every, Plain
 
 SETTINGS = {"learning_starts": 50, "train_freq": 4, "batch_size": 16, "buffer_size": 500, "seed": 0}
 
@@ -60,34 +65,14 @@ def test_squared_loss_by_hand(discounts, loss):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "env_id"),
-    [
-        # Synchronised before each update, the online network's best action is the target network's.
-        (DoubleDQN, "CartPole-v1"),
-        # Huber's loss is half the squared error below 1, which no error on the lake exceeds here.
-        (DeepQLearning, "FrozenLake-v1"),
-    ],
-)  # fmt: skip
+    ("algorithm", "env_id"), [(DoubleDQN, "CartPole-v1"), (DeepQLearning, "FrozenLake-v1")]
+)
 def test_where_it_is_dqn_to_the_bit(algorithm, env_id):
+    """Where its target network is the online one; and where no error exceeds 1, as Huber has it."""
     arguments = {**SETTINGS, "exploration_fraction": 1, "target_update_interval": 1}
     models = [each("MlpPolicy", env_id, **arguments).learn(250) for each in (DQN, algorithm)]
     weights = [parameters_to_vector(model.q_net.parameters()) for model in models]
     assert th.equal(*weights)
-
-
-# --- augmented random search ---------------------------------------------------------------------
-
-
-class Ended(BaseCallback):
-    """How many episodes ended on each call."""
-
-    def __init__(self):
-        super().__init__()
-        self.counts = []
-
-    def _on_step(self):
-        self.counts.append(int(np.sum(self.locals["dones"])))
-        return True
 
 
 def ars(n_envs=1, env="CartPole-v1", **kwargs):
@@ -96,10 +81,10 @@ def ars(n_envs=1, env="CartPole-v1", **kwargs):
 
 
 def test_a_budget_of_episodes_ends_the_search():
-    ended = Ended()
-    model = ars(2).learn(10**12, callback=[ended, EpisodeBudget(7)])
-    assert sum(ended.counts) >= 7 > sum(ended.counts[:-1])
-    assert model.num_timesteps == 2 * ended.n_calls
+    plain = Plain()
+    model = ars(2).learn(10**12, callback=[plain, EpisodeBudget(7)])
+    assert sum(plain.ended) >= 7 > sum(plain.ended[:-1])
+    assert model.num_timesteps == 2 * plain.n_calls
 
 
 def test_what_was_loaded_goes_on_from_its_weights(tmp_path):
@@ -125,18 +110,25 @@ def test_the_search_itself_is_the_librarys():
     assert th.equal(ours.weights, theirs.weights)
 
 
-# --- agents that do not learn --------------------------------------------------------------------
+class Any(gym.Env):
+    """An environment of any spaces, whose model is not known."""
+
+    def __init__(self, observations=None, actions=None, shown=None, ends=0.1):
+        self.observation_space = observations or spaces.Box(-1, 1, (2,), np.float32)
+        self.action_space = actions or spaces.Discrete(2)
+        self.shown, self.ends = shown, ends
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        obs = self.observation_space.sample() if self.shown is None else self.shown
+        return obs, 0.5, bool(self.np_random.random() < self.ends), False, {}
+
 
 N = 5000
-
-
-class Still(gym.Env):
-    """Nothing happens here, whatever is done."""
-
-    observation_space = spaces.Discrete(1)
-
-    def __init__(self, action_space):
-        self.action_space = action_space
 
 
 BOX = spaces.Box(np.array([-1, 0], np.float32), np.array([1, 10], np.float32))
@@ -152,8 +144,8 @@ def test_random_actions_are_uniform_and_follow_the_seed(kind):
     space, shape, n_options, number = NUMBERED[kind]
 
     def drawn():
-        agent = RandomAgent("RandomPolicy", Still(space), seed=7)
-        return agent.predict(np.zeros(N, dtype=np.int64), deterministic=False)[0]
+        agent = RandomAgent("RandomPolicy", Any(actions=space), seed=7)
+        return agent.predict(np.zeros((N, 2), np.float32), deterministic=False)[0]
 
     actions = drawn()
     assert actions.shape == (N, *shape)
@@ -169,3 +161,164 @@ def test_the_cart_is_pushed_to_where_the_pole_leans():
     for angle, others in itertools.product((-0.2, -1e-6, 0.0, 1e-6, 0.2), (-2.0, 2.0)):
         action, _ = agent.predict(np.array([others, others, angle, others], np.float32))
         assert action == (1 if angle > 0 else 0)
+
+
+SMALL = {"buffer_size": 100, "learning_starts": 10}
+SHORT = {"n_steps": 32, "batch_size": 32}
+
+
+def lake():
+    return make_vec_env("FrozenLake-v1", 8, seed=0)
+
+
+def made(name, env, policy="MlpPolicy", **kwargs):
+    return load_algorithm(name)(policy, env, device="cpu", seed=0, **kwargs)
+
+
+LONG, FEW = 200_000, 2_000
+TOO_SHORT = "library: so short a training is not worth compiling"
+BRIDGED = "compiled but for the environment: "
+AUTO = {"engine": "auto"}
+PLANS = [
+    # agent, settings, environment, callback, budget, what is chosen
+    ("ppo", {}, lake, None, LONG, "library"),
+    ("deep_qlearning", {}, lake, None, LONG, "compiled"),
+    ("dqn", AUTO, lake, None, LONG, "compiled"),
+    ("dqn", AUTO, lake, None, FEW, TOO_SHORT),
+    # A rollout is collected to its end, which here takes 16,384 steps.
+    ("ppo", AUTO, lake, None, FEW, "compiled"),
+    ("double_dqn", {"engine": "compiled"}, lake, None, 1, "compiled"),
+    # Not the steps count, but what is learnt from them.
+    (
+        "dqn",
+        {**AUTO, "learning_starts": LONG},
+        lambda: gym.make("CartPole-v1"),
+        None,
+        10_000,
+        TOO_SHORT,
+    ),
+    # Callbacks move the environment to Python, and never the engine.
+    ("double_dqn", {}, lake, lambda: Every(1000), LONG, "compiled"),
+    ("double_dqn", {}, lake, Plain, LONG, f"{BRIDGED}Plain must be asked after each step"),
+    ("double_dqn", {}, lake, lambda: [EpisodeBudget(10)], 10**12, TOO_SHORT),
+]
+
+
+@pytest.mark.parametrize("case", range(len(PLANS)))
+def test_which_engine_trains(case):
+    name, settings, env, callback, budget, chosen = PLANS[case]
+    model = made(name, env(), **settings)
+    assert str(model.engine_plan(budget, callback and callback())) == chosen
+
+
+class OwnDQN(load_algorithm("dqn")):
+    """A user's own."""
+
+    def train(self, gradient_steps, batch_size=100):
+        pass
+
+
+REFUSALS = {  # reason: agent, environment, settings
+    "it masks actions": (
+        "dqn", lambda: ActionMasks(gym.make("Warehouse-v0")), {"mask_actions": True}),
+    "actions are Box, not Discrete": ("ppo", lambda: gym.make("Pendulum-v1"), {}),
+    "a network has a layer of Hardtanh": (
+        "ppo", Any, {"policy_kwargs": {"activation_fn": nn.Hardtanh}}),
+    "OwnDQN may do things in Python of its own": (OwnDQN, Any, {}),
+    "some of its parameters are frozen": ("ppo", Any, {}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("reason", REFUSALS)
+def test_compiled_says_why_not_and_auto_falls_back(reason):
+    name, env, settings = REFUSALS[reason]
+    settings = {"policy": "MlpPolicy", **(SHORT if name == "ppo" else {}), **settings}
+    algorithm = name if isinstance(name, type) else load_algorithm(name)
+    model = algorithm(env=env(), engine="compiled", **settings)
+    if "frozen" in reason:
+        model.policy.value_net.weight.requires_grad_(False)
+    with pytest.raises(ValueError, match=f"^engine: compiled is not possible: {reason}$"):
+        model.learn(30)
+    model.engine = "auto"
+    model.learn(30)
+    assert model.engine_in_use == f"library: {reason}"
+    assert model.num_timesteps >= 30
+
+
+@pytest.mark.parametrize(("name", "at_end"), [("dqn", True), ("ppo", False)])
+def test_states_that_networks_have_no_weights_for_are_refused(name, at_end):
+    """Compiled code would read whatever lies behind the weights."""
+    model = made(name, Any(spaces.Discrete(3), shown=3, ends=float(at_end)), engine="compiled")
+    with pytest.raises(ValueError, match=r"observation 3 is not in Discrete\(3\)"):
+        model.learn(100)
+
+
+def test_a_training_that_diverges_is_ended():
+    env = Any(shown=np.full(2, np.nan, np.float32), ends=0)
+    for name in ("ppo", "a2c"):
+        model = made(name, env, n_steps=64, engine="compiled")
+        with pytest.raises(ValueError, match="training has diverged"):
+            model.learn(100)
+    model = made("dqn", env, engine="compiled", **SMALL).learn(100)
+    assert all(bool(p.isnan().all()) for p in model.q_net.parameters())
+
+
+Q = {"learning_starts": 50, "buffer_size": 400, "target_update_interval": 20}
+FALLING = library_schedule(ExponentialSchedule(0.001, 0.0001))
+AGENTS = {
+    "double_dqn": ("DQN", "CartPole-v1", Q),
+    "ppo": (
+        "PPO", "FrozenLake-v1",
+        {"n_steps": 64, "n_epochs": 2, "learning_rate": FALLING, "clip_range": FALLING}),
+}  # fmt: skip
+ELSEWHERE = """
+import sys
+sys.modules["rl_yardstick"] = None  # as where it is not installed
+import gymnasium, stable_baselines3, torch
+for line in sys.stdin.read().splitlines():
+    kind, path, env = line.split("|")
+    model = getattr(stable_baselines3, kind).load(path, env=gymnasium.make(env), device="cpu")
+    before = torch.cat([p.detach().flatten() for p in model.policy.parameters()])
+    model.learn(200, reset_num_timesteps=False)
+    after = torch.cat([p.detach().flatten() for p in model.policy.parameters()])
+    print(path, bool((before != after).any()), bool(after.isfinite().all()), sep="|")
+"""
+
+
+def saved(name, folder, env=None, engine="compiled", asked=()):
+    """A model after a training with a checkpoint, which has been saved."""
+    _, usual, settings = AGENTS[name]
+    model = made(name, make_vec_env(env or usual, seed=0), engine=engine, **settings)
+    model.learn(300, callback=[CheckpointCallback(200, folder), *asked]).save(folder / "after")
+    assert model.engine_in_use.startswith(engine)
+    return model
+
+
+def steps_of(model):
+    return {float(kept["step"]) for kept in model.policy.optimizer.state.values()}
+
+
+def test_files_open_where_this_project_is_not(tmp_path):
+    lines, expected = [], []
+    for name, (kind, env, _) in AGENTS.items():
+        saved(name, tmp_path / name)
+        for path in (tmp_path / name / "rl_model_200_steps.zip", tmp_path / name / "after.zip"):
+            lines.append(f"{kind}|{path}|{env}")
+            expected.append(f"{path}|True|True")
+    command, text = [sys.executable, "-c", ELSEWHERE], "\n".join(lines)
+    done = subprocess.run(command, input=text, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == expected, done.stderr
+
+
+@pytest.mark.parametrize(("name", "asked"), [("double_dqn", ()), ("ppo", (Plain,))])
+def test_files_go_on_in_either_engine(name, asked, tmp_path):
+    model = saved(name, tmp_path, "CartPole-v1", "compiled", [kind() for kind in asked])
+    for engine in ("library", "compiled"):
+        env = make_vec_env("CartPole-v1", seed=1)
+        loaded = load_algorithm(name).load(tmp_path / "after", env, engine=engine)
+        weights = loaded.policy.state_dict(), model.policy.state_dict()
+        assert all(map(th.equal, *(each.values() for each in weights)))
+        assert steps_of(loaded) == steps_of(model)
+        loaded.learn(200, reset_num_timesteps=False)
+        assert loaded.num_timesteps >= 500
+        assert min(steps_of(loaded)) > max(steps_of(model))

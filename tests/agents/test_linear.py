@@ -14,8 +14,6 @@ from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.linear.tiles import make_tiles, tiles_of_all
 from tests.agents.hand_fed import Told
 
-# --- tiles ---------------------------------------------------------------------------------------
-
 UNIT = spaces.Box(0.0, 1.0, (2,))
 UNBOUNDED = spaces.Box(np.array([-4.8, -np.inf], "f4"), np.array([4.8, np.inf], "f4"))
 
@@ -46,9 +44,8 @@ def test_bounds_belong_to_the_space_and_what_lies_outside_to_the_bounds():
     low, high = BOUNDS.low.astype(float), BOUNDS.high.astype(float)
     nearly = high - 1e-9
     assert active(tiles, high, high + 5, np.full(2, np.inf)) == 3 * active(tiles, nearly)
-    assert active(tiles, low, low - 5, np.full(2, -np.inf), np.full(2, np.nan)) == 4 * active(
-        tiles, low
-    )
+    lowest = active(tiles, low, low - 5, np.full(2, -np.inf), np.full(2, np.nan))
+    assert lowest == 4 * active(tiles, low)
     assert set(active(tiles, low)[0]).isdisjoint(active(tiles, high)[0])
 
 
@@ -70,8 +67,6 @@ def test_settings_that_make_no_tiling(settings, message):
     with pytest.raises(ValueError, match=message):
         make_tiles(UNBOUNDED, **settings, n_actions=3)
 
-
-# --- semi-gradient control -----------------------------------------------------------------------
 
 LINE = spaces.Box(0.0, 4.0, (1,))
 HERE, THERE = np.array([0.25], "f4"), np.array([2.25], "f4")
@@ -113,9 +108,6 @@ def test_semi_gradient_sarsa_judges_by_the_action_that_it_commits_to():
         assert weights[0, 0] == 2 + 0.5 * weights[1, told.committed]
         chosen.add(told.committed)
     assert chosen == {0, 1}
-
-
-# --- policy gradients ----------------------------------------------------------------------------
 
 
 def softmax(preferences):
@@ -206,9 +198,8 @@ def test_where_an_episode_is_truncated_the_baseline_goes_on():
         told.step(1, 0, 2, 2, "truncated")
         compared = 2 if baseline == "value" else 0
         change = 0.1 * (returns - compared) * 0.5
-        np.testing.assert_allclose(
-            told.agent.policy.weights.numpy()[1], [change, -change], rtol=1e-14
-        )
+        weights = told.agent.policy.weights.numpy()
+        np.testing.assert_allclose(weights[1], [change, -change], rtol=1e-14)
         assert values.tolist() == ([1, 2 + 0.5 * 3, 6] if baseline == "value" else [])
 
 
@@ -265,9 +256,7 @@ def test_the_corridor_is_left_by_chance_and_defeats_bootstrapping(name, settings
 
 def test_a_step_of_one_goes_along_the_gradient_of_the_logarithm():
     """Against central differences; tiles share the step, so that it is a third at each."""
-    told = Told(
-        "reinforce", spaces.Box(0.0, 1.0, (2,)), 3, n_tilings=3, n_tiles=2, learning_rate=1.0
-    )
+    told = Told("reinforce", UNIT, 3, n_tilings=3, n_tiles=2, learning_rate=1.0)
     weights = told.agent.policy.weights.numpy()
     weights[:] = before = np.random.default_rng(0).normal(size=weights.shape)
     obs, action, tiny = np.array([0.3, 0.8], "f4"), 2, 1e-6
@@ -294,7 +283,6 @@ TILINGS = st.fixed_dictionaries(
         "n_tiles": st.lists(st.integers(1, 9), min_size=2, max_size=2),
     }
 )
-BOUNDS = spaces.Box(np.array([-1.2, -0.07], "f4"), np.array([0.6, 0.07], "f4"))
 PLACES = st.tuples(st.floats(-2, 2, width=32), st.floats(-0.125, 0.125, width=32))
 
 

@@ -109,8 +109,6 @@ def few(n):
     return settings(max_examples=n, deadline=None, derandomize=True)
 
 
-# --- what is masked is not done ------------------------------------------------------------------
-
 GREEDILY = {"exploration_initial_eps": 0.5, "exploration_decay": "constant"}
 TRIED = {
     **{name: GREEDILY for name in TABULAR if name not in OPTIMISTIC},
@@ -184,8 +182,6 @@ def test_a_zip_brings_the_masks_back(tmp_path):
     assert np.array_equal(loaded.policy.masks, model.policy.masks)
 
 
-# --- updates of tables ---------------------------------------------------------------------------
-
 # Of the next state's values the best one, of action 3, is masked, and so is that of action 0.
 VALUES, OTHERS = [10.0, 4.0, 2.0, 50.0], [0.0, -7.0, 8.0, 90.0]
 NEXT_MASKS = np.array([[1, 1, 1, 1], [0, 1, 1, 0], [1, 1, 1, 1]], bool)
@@ -221,9 +217,6 @@ def test_targets_are_those_of_the_allowed_actions(row):
         found.add(round(value, 12))
         assert name != "sarsa" or value == 3 + 0.5 * VALUES[agent._next_actions[0]]
     assert found == {round(target, 12) for target in targets}
-
-
-# --- rules of bandits ----------------------------------------------------------------------------
 
 
 def knowing(name, scores, counts=(1,) * A, **kwargs):
@@ -274,8 +267,6 @@ def test_gradient_step_among_the_arms_of_the_pull():
     assert model.policy.counts[0].tolist() == [2, 1, 0, 2]
     assert model.policy.sums[0].tolist() == [1.0, 3.0, 0.0, 9.0]
 
-
-# --- deep Q-learning -----------------------------------------------------------------------------
 
 SMALL = {"seed": 0, "learning_starts": 50, "policy_kwargs": {"net_arch": [8]}}
 MASKED = {"policy": "MlpPolicy", "mask_actions": True, "buffer_size": 1000, **SMALL}
@@ -343,9 +334,6 @@ def test_deep_targets_by_hand(algorithm, expected):
     assert 0 < in_state_1.sum() < 64
     assert set(values.amax(dim=1)[in_state_1].tolist()) == {expected}
     assert set(values.amax(dim=1)[~in_state_1].tolist()) == {0.0}
-
-
-# --- refusals ------------------------------------------------------------------------------------
 
 
 def told(name, masks):

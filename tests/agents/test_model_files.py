@@ -31,9 +31,6 @@ def through_json(value):
     return decode(json.loads(json.dumps(encode(value))))
 
 
-# --- arrays, numbers, containers -----------------------------------------------------------------
-
-
 @given(npst.arrays(st.one_of(ARRAY_DTYPES), npst.array_shapes(min_dims=0, min_side=0)))
 def test_arrays_come_back_to_the_last_bit(array):
     back = through_json(array)
@@ -94,11 +91,10 @@ def shown(value):
         numbers = [value.integers(2**32, dtype=np.uint32).item() for _ in range(2)]
         return numbers, value.standard_normal(8).tolist()
     if isinstance(value, gym.Space):
+        is_seeded = value._np_random is not None
         nested = [shown(part) for part in value.spaces.values()] if hasattr(value, "keys") else []
-        state = value._np_random and [
-            spaces.flatten(value, value.sample()).tolist() for _ in range(3)
-        ]
-        return repr(value), value.shape, value.dtype, nested, state
+        drawn = [spaces.flatten(value, value.sample()).tolist() for _ in range(3 * is_seeded)]
+        return repr(value), value.shape, value.dtype, nested, drawn
     says = [value(progress) for progress in (1.0, 0.6, 0.0)] if callable(value) else []
     return repr(value), says, getattr(value, "dtype", None)
 
@@ -116,9 +112,6 @@ def test_it_comes_back_and_goes_on_where_it_was(name):
             decode(less)
     with pytest.raises(ValueError, match=f"damaged {text['type']} in an agent's file"):
         decode({**text, "seed": 1})
-
-
-# --- what has no place in the format -------------------------------------------------------------
 
 
 # A class that only calls itself what the format knows.
@@ -143,8 +136,6 @@ def test_other_types_are_refused_wherever_they_stand(kind):
         with pytest.raises(UnknownTypeError, match="cannot be written as JSON"):
             encode(nested)
 
-
-# --- damaged files -------------------------------------------------------------------------------
 
 json_values = st.recursive(
     plain,
@@ -180,20 +171,6 @@ def test_any_json_is_decoded_or_refused(data):
         return
     # What was let in is nothing but what the format knows.
     json.dumps(encode(value))
-
-
-OUT_OF_RANGE = [
-    {"type": "os.system", "n": 3},
-    {"type": "Discrete", "n": 3, "start": 0, "rng": 7},
-    {"type": "ndarray", "dtype": "O", "values": [1], "shape": [1]},
-    {"type": "ExponentialSchedule", "start": 0.0, "end": 1.0, "end_fraction": 1.0},
-]
-
-
-@pytest.mark.parametrize("damage", OUT_OF_RANGE, ids=str)
-def test_what_is_not_in_the_table_or_out_of_range_is_not_built(damage):
-    with pytest.raises(ValueError, match=r"."):
-        decode(damage)
 
 
 @pytest.mark.parametrize("name", ["qlearning", "reinforce", "ucb", "optimal"])

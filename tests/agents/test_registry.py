@@ -1,21 +1,19 @@
 """The table of agents: where they live, what spaces they fit, and how others are added."""
 
 import importlib.util
-import re
+import math
 import sys
-from pathlib import Path
 
 import gymnasium as gym
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-import rl_yardstick.envs  # noqa: F401  # registers the bandits
+import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick import agents
 from rl_yardstick.agents import ALGORITHMS, fitting_algorithms, load_algorithm
-from rl_yardstick.agents.bandits.runs import run_batch
 from rl_yardstick.pipeline.components import constructor_parameters
-from tests.agents.hand_fed import Told
+from tests.agents.hand_fed import Spaces
 
 DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))
 PLANNING = ["value_iteration", "policy_iteration", "optimal"]
@@ -117,9 +115,6 @@ def test_an_optional_package_that_is_missing(monkeypatch):
         load_algorithm("qrdqn")
 
 
-# --- agents that are added -----------------------------------------------------------------------
-
-
 MINE = "some_module:Mine"
 
 
@@ -141,40 +136,63 @@ def test_what_cannot_be_registered(name, entry_point, fields, complaint):
     assert before == ALGORITHMS
 
 
-# --- the agents that CONTRIBUTING.md writes, as they stand there ----------------------------------
+INF, NAN = math.inf, math.nan
+TWO = {"initial_q_std": 1e308, "seed": 0}  # one of the numbers that are drawn is above 1.8
+EXPONENTIAL = {"exploration_decay": "exponential", "exploration_final_eps": 0.0}
+VECTORS = {"env": Spaces(spaces.Box(-1, 1, (4,)))}
+MATRICES = {"env": Spaces(spaces.Box(-1, 1, (2, 2)))}
+NO_MASKS = r"^mask_actions: the environment has no method action_masks\(\)"
+NOISY, UNDISCOUNTED = {"exploration": "gaussian_noise"}, {"gamma": 1.0, "value_bound": 1.0}
+REFUSED = [
+    ("qlearning", {"gamma": 1.5}, "gamma must lie between 0 and 1"),
+    ("qlearning", TWO, "initial_q and initial_q_std must give finite values"),
+    ("qlearning", {"exploration": "greedy"}, "exploration must be one of epsilon_greedy"),
+    ("qlearning", {"learning_rate": "average"}, "learning_rate must be a number"),
+    ("qlearning", {"learning_rate": -0.1}, "learning_rate must be at least 0, not -0.1"),
+    ("qlearning", {"learning_rate": INF}, "learning_rate must be finite, not inf"),
+    ("qlearning", {"exploration": "boltzmann", "temperature": 0.0}, "temperature must be above 0"),
+    ("qlearning", EXPONENTIAL, "start and end above 0"),
+    ("qlearning", {"engine": "fast"}, "one of auto, compiled, interpreted, not 'fast'"),
+    ("qlearning", {"env": "CartPole-v1"}, "Discrete space that starts at 0"),
+    ("qlearning", {"mask_actions": True}, NO_MASKS),
+    ("expected_sarsa", NOISY, "take epsilon_greedy or boltzmann"),
+    ("n_step_tree_backup", {"n_steps": 0}, "n_steps must be a whole number of at least 1, not"),
+    ("n_step_tree_backup", {"n_steps": 1.5}, "n_steps must be a whole number of at least 1, not"),
+    ("n_step_tree_backup", {"n_steps": True}, "n_steps must be a whole number of at least 1, not"),
+    ("n_step_tree_backup", NOISY, "target_policy: exploring needs the probabilities"),
+    ("off_policy_monte_carlo", {"learning_rate": 0.1}, "must be 'sample_average', not 0.1"),
+    ("off_policy_monte_carlo", NOISY, "needs the probabilities of the actions"),
+    ("dyna_q", {"planning_steps": -1}, "planning_steps must be a whole number of at least 0"),
+    ("q_lambda", {"skip_terminal_update": True}, "is for the agents that learn from"),
+    ("r_max", UNDISCOUNTED, "gamma must be below 1"),
+    ("r_max", {"known_after": 10**30}, "known_after must be at most 1000000000, not 1000"),
+    ("qlearning_ucb", {"gamma": 1.0}, "value_bound has to be given where gamma is 1"),
+    ("qlearning_ucb", UNDISCOUNTED, "horizon has to be given where gamma is 1"),
+    ("reinforce", {"initial_preferences": [1, 2, 3]}, "must be a number or 4 numbers"),
+    ("reinforce", {"initial_preferences": INF}, "initial_preferences must be finite, not inf"),
+    ("reinforce", {"learning_rate": "sample_average"}, "must be a number or a schedule"),
+    ("epsilon_greedy", {"learning_rate": "averge"}, "a schedule or 'sample_average', not 'averge'"),
+    ("ucb", VECTORS, "observations in a Discrete space"),
+    ("ucb", {"mask_actions": True}, NO_MASKS),
+    ("kl_ucb", {"c": NAN}, "c must be at least 0, not nan"),
+    ("exp3", {"mixing": 0.0}, "mixing must be above 0, not 0.0"),
+    ("exp3", {"mixing": 1.1}, "mixing must lie between 0 and 1, not 1.1"),
+    ("thompson", {"prior_mean": INF}, "prior_mean must be finite, not inf"),
+    ("linucb", MATRICES, r"observations of shape \(d,\) in a Box space or in a Discrete space"),
+    ("mabwiser_ucb1", {"tie_breaking": "random"}, "has no argument 'tie_breaking'"),
+    ("ppo", {"engine": "fast", "policy": "MlpPolicy"}, "engine must be one of"),
+    ("qlearning", {"gama": 0.5}, "^QLearning has no argument 'gama'"),
+    ("qlearning_ucb", {"learning_rate": 0.5}, "has no argument 'learning_rate'"),
+    ("qlearning_ucb", {"exploration": 0.5}, "has no argument 'exploration'"),
+    ("lin_thompson", {"ignore_context": 0.5}, "has no argument 'ignore_context'"),
+    ("lin_thompson", {"learning_rate": 0.5}, "has no argument 'learning_rate'"),
+    ("mabwiser_ucb1", {"mask_actions": 0.5}, "has no argument 'mask_actions'"),
+]
 
-DOCUMENT = Path(__file__).parents[2] / "CONTRIBUTING.md"
-EXAMPLES = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
 
-
-@pytest.fixture
-def example(tmp_path):
-    """The class of one of the examples, from a module of its own."""
-
-    def load(name):
-        (code,) = [code for code in EXAMPLES if f"class {name}(" in code]
-        path = tmp_path / f"example_{name.lower()}.py"
-        path.write_text(code)
-        spec = importlib.util.spec_from_file_location(path.stem, path)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return getattr(module, name)
-
-    return load
-
-
-def test_a_tabular_rule(example):
-    """Next values 4, 8, 6, 6: half the mean and half the best 8 make 7, and 2 + 0.5 * 7 is 5.5."""
-    cautious = example("CautiousQLearning")
-    told = Told(cautious, 2, 4, caution=0.5, gamma=0.5, learning_rate=1.0)
-    told.agent.policy.q_tables.numpy()[0, 1] = [4, 8, 6, 6]
-    told.step(0, 3, 2.0, 1)
-    assert told.agent.policy.q_table[0, 3] == 2 + 0.5 * (0.5 * 6 + 0.5 * 8)
-    assert cautious(env="FrozenLake-v1").learn(0).engine_in_use == "compiled"
-    with pytest.raises(ValueError, match="caution must lie between 0 and 1, not 2"):
-        cautious(env="FrozenLake-v1", caution=2)
-
-
-def test_a_bandit_index(example):
-    batch = run_batch(example("MOSS"), {}, "BernoulliBandit-v0", {}, [0, 1], 200)
-    assert batch.optimal[:, 100:].mean() > 0.5
+@pytest.mark.parametrize(("name", "arguments", "line"), REFUSED, ids=str)
+def test_wrong_arguments(name, arguments, line):
+    usual = "SegmentBandit-v0" if ALGORITHMS[name].for_bandits else "FrozenLake-v1"
+    with pytest.raises((TypeError, ValueError), match=line) as refusal:
+        load_algorithm(name)(**{"env": usual, **arguments})
+    assert "\n" not in str(refusal.value)

@@ -19,9 +19,6 @@ def assert_close(found, expected):
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
-# --- n steps -------------------------------------------------------------------------------------
-
-
 def textbook_table(table, steps, end, n, ahead, backed_up):
     """The table after an episode that ends in state 0, by the boxes of chapter 7.
 
@@ -87,8 +84,6 @@ def test_tree_backup(table, steps, end, n, epsilon, target_policy):
         fed.episode(steps, end)
         assert_close(fed.table, expected)
 
-
-# --- traces --------------------------------------------------------------------------------------
 
 TRACES = ("sarsa_lambda", "q_lambda")
 
@@ -179,9 +174,6 @@ def test_dutch_traces_are_the_online_lambda_return(name, learning_rate, table, s
         assert_close(fed.table, by_online_lambda_returns(name, before, taken, end, decay, sizes))
 
 
-# --- Monte Carlo ---------------------------------------------------------------------------------
-
-
 @settings(max_examples=25)
 @given(table=tables(), steps=episodes(), end=ENDS)
 @pytest.mark.parametrize("every_visit", [False, True])
@@ -270,9 +262,6 @@ def test_off_policy_monte_carlo_by_hand():
     # An action that the greedy policy would not have taken tells nothing of what came before.
     assert learn(0, 0, 0.25) == [[pytest.approx(2.625), 0], [0, 2.5]]
     np.testing.assert_allclose(sums, [[16 / 3, 0], [1, 2]], rtol=1e-15)
-
-
-# --- what they come down to ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import FloatSchedule
 
@@ -14,8 +13,6 @@ from rl_yardstick.mdp import TransitionModel, value_iteration
 from tests.agents.hand_fed import Fed
 
 ONE_STEP = ("qlearning", "sarsa", "expected_sarsa", "double_qlearning")
-
-# --- one table of updates -------------------------------------------------------------------------
 
 # Two states, three actions. The transition: state 0, action 1, reward 2, then state 1; gamma is a
 # half, the step size a tenth.
@@ -109,9 +106,6 @@ def test_updates_by_hand(row):
         assert fed.committed == (1 if name == "sarsa" else -1)
 
 
-# --- one step ------------------------------------------------------------------------------------
-
-
 def test_sarsa_judges_by_the_action_that_it_commits_to():
     met = set()
     for seed in range(9):
@@ -153,31 +147,6 @@ def test_termination_leaves_the_reward_alone_and_truncation_does_not(name):
         assert changed == (end != "terminated")
 
 
-# --- in an environment ---------------------------------------------------------------------------
-
-
-class Tracer(BaseCallback):
-    actions, commitments = (), ()
-
-    def _on_step(self):
-        self.actions += (int(self.locals["actions"][0]),)
-        return True
-
-    def _on_rollout_end(self):
-        self.commitments += (int(self.model._next_actions[0]),)
-
-
-def test_sarsa_does_what_it_committed_to():
-    tracer, env = Tracer(), gym.make("RiverSwim-v0", max_episode_steps=-1)
-    uniform = {"exploration_decay": "constant", "exploration_initial_eps": 1.0}
-    load_algorithm("sarsa")(env=env, seed=0, **uniform).learn(300, callback=tracer)
-    assert tracer.commitments[:-1] == tracer.actions[1:]
-    assert set(tracer.actions) == {0, 1}
-
-
-# --- optimism ------------------------------------------------------------------------------------
-
-
 def test_one_update_by_hand():
     """Thrice the same step: state 0, action 1, reward 2, then state 1; H = 3, bonus 6 / sqrt(N)."""
     settings = {"value_bound": 10.0, "bonus_scale": 6.0, "horizon": 3.0}
@@ -206,9 +175,6 @@ def test_tables_begin_where_they_are_told_to():
     assert drawn.std() == pytest.approx(2, abs=4 * 2 / 6000**0.5)
 
 
-# --- Dyna-Q --------------------------------------------------------------------------------------
-
-
 def test_planning_draws_pairs_and_outcomes_alike():
     """With a step size of nearly 0 the sum of updates tells how often which reward was drawn."""
     n, tiny = 30_000, 1e-12
@@ -227,22 +193,19 @@ MAZE = {"desc": ["S.#", "..G"], "step_reward": 0, "shelf_reward": 0, "goal_rewar
 
 
 @pytest.mark.parametrize(
-    ("name", "settings"), [("dyna_q", {}), ("prioritized_sweeping", {"threshold": 0.0})]
+    ("name", "own"), [("dyna_q", {}), ("prioritized_sweeping", {"threshold": 0})]
 )
-def test_much_planning_ends_in_the_optimum(name, settings):
+def test_much_planning_ends_in_the_optimum(name, own):
     """All pairs of a small maze were tried: their values are those of the best policy, exactly."""
     env = make_vec_env("Warehouse-v0", seed=0, env_kwargs=MAZE)
     uniform = {"exploration_decay": "constant", "exploration_initial_eps": 1.0}
-    settings = {"planning_steps": 50, "learning_rate": 1.0, **uniform, **settings}
+    settings = {"planning_steps": 50, "learning_rate": 1.0, **uniform, **own}
     agent = load_algorithm(name)(env=env, seed=0, gamma=0.9, **settings).learn(1500)
     model = transition_model(gym.make("Warehouse-v0", **MAZE))
     tried = agent.policy.model.counts > 0
     assert tried[model.reachable].all()
     expected = value_iteration(model, 0.9).action_values
     np.testing.assert_allclose(agent.policy.q_table[tried], expected[tried], atol=1e-12)
-
-
-# --- prioritised sweeping ------------------------------------------------------------------------
 
 
 def test_the_largest_error_comes_first():
@@ -259,9 +222,6 @@ def test_the_largest_error_comes_first():
         order.append(int(np.flatnonzero(fed.table[:, 0] != before)[0]))
     assert order == [1, 6, 3, 5, 0, 4, 2]
     assert fed.table[:, 0].tolist() == [3, -7, 1, 5, 2, -4, -0.5, 0]
-
-
-# --- R-max ---------------------------------------------------------------------------------------
 
 
 def test_r_max_plans_the_optimum_of_what_it_has_counted():
@@ -281,12 +241,3 @@ def test_r_max_plans_the_optimum_of_what_it_has_counted():
     )
     optimum = value_iteration(counted, 0.9).action_values
     np.testing.assert_allclose(agent.policy.q_table, optimum, atol=1e-8)
-
-
-def test_q_learning_chooses_after_the_update():
-    """Action 0 earns next to nothing, so that its value falls below that of action 1."""
-    tracer, settings = Tracer(), {"learning_rate": 0.5, "gamma": 0.0, "initial_q": 1.0}
-    settings |= {"exploration_decay": "constant", "exploration_initial_eps": 0.0}
-    model = load_algorithm("qlearning")(env="RiverSwim-v0", tie_breaking="first", **settings)
-    model.learn(2, callback=tracer)
-    assert tracer.actions == (0, 1)

@@ -9,45 +9,29 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents.compiled import worlds
 from rl_yardstick.agents.compiled.env_states import COMPENSATED_SUM
 from rl_yardstick.agents.compiled.loop import add_to_return, begin_episode
 from rl_yardstick.agents.compiled.references import handles_of, next_uniform
-from rl_yardstick.agents.compiled.worlds import (
-    CAR_STATE,
-    CART_POLE_ENV,
-    MOUNTAIN_CAR_ENV,
-    STATE,
-    bin_index,
-    compile_envs,
-    drive,
-    swing,
-)
 from rl_yardstick.envs.wrappers import DiscretizeObservation
 from rl_yardstick.machine_code.compiling import kernel
 
-# --- physics -------------------------------------------------------------------------------------
-
 
 @numba.njit
-def swing_each(records, world, terminated):
+def step_each(records, world, terminated):
     for i in range(len(records)):
-        terminated[i] = swing(world, records[i])
-
-
-@numba.njit
-def drive_each(records, world, terminated):
-    for i in range(len(records)):
-        terminated[i] = drive(world, records[i])
+        world.step(records[i], 0)
+        terminated[i] = records[i].terminated
 
 
 @numba.njit
 def bins_of(records, world, indices):
     for i in range(len(records)):
-        indices[i] = bin_index(world, records[i])
+        indices[i] = worlds.bin_index(world, records[i])
 
 
 def world_of(env):
-    return compile_envs(DummyVecEnv([lambda: env]))
+    return worlds.compile_envs(DummyVecEnv([lambda: env]))
 
 
 def pole(base=None, **kwargs):
@@ -66,17 +50,16 @@ MOON |= {"polemass_length": 0.21, "length": 0.7, "x_threshold": 1.0, "theta_thre
 HILLS = {"force": 0.002, "gravity": 0.003, "max_speed": 0.05, "goal_position": 0.4}
 HILLS |= {"min_position": -1.1, "max_position": 0.5}
 SEMI_IMPLICIT = {"kinematics_integrator": "semi-implicit euler"}
+POLE = step_each, worlds.CART_POLE_ENV, worlds.STATE
+CAR = step_each, worlds.MOUNTAIN_CAR_ENV, worlds.CAR_STATE
 PHYSICS = {
-    "pole": (pole, swing_each, CART_POLE_ENV, STATE),
-    "semi-implicit pole": (
-        lambda: altered(pole(), **SEMI_IMPLICIT), swing_each, CART_POLE_ENV, STATE),
-    "pole on the moon": (lambda: altered(pole(), **MOON), swing_each, CART_POLE_ENV, STATE),
-    "car": (MountainCarEnv, drive_each, MOUNTAIN_CAR_ENV, CAR_STATE),
-    "stopping car": (
-        lambda: MountainCarEnv(goal_velocity=0.03), drive_each, MOUNTAIN_CAR_ENV, CAR_STATE),
-    "car in hills": (
-        lambda: altered(MountainCarEnv(), **HILLS), drive_each, MOUNTAIN_CAR_ENV, CAR_STATE),
-}  # fmt: skip
+    "pole": (pole, *POLE),
+    "semi-implicit pole": (lambda: altered(pole(), **SEMI_IMPLICIT), *POLE),
+    "pole on the moon": (lambda: altered(pole(), **MOON), *POLE),
+    "car": (MountainCarEnv, *CAR),
+    "stopping car": (lambda: MountainCarEnv(goal_velocity=0.03), *CAR),
+    "car in hills": (lambda: altered(MountainCarEnv(), **HILLS), *CAR),
+}
 
 
 def random_states(n):
@@ -98,7 +81,7 @@ def test_steps_equal_gymnasiums(case):
     make, step_each, kind, names = PHYSICS[case]
     env, rng = make(), np.random.default_rng(0)
     states = random_states(20_000)
-    if kind is MOUNTAIN_CAR_ENV:
+    if kind is worlds.MOUNTAIN_CAR_ENV:
         states = rng.uniform([-1.1, -0.05], [0.5, 0.05], (20_000, 2))
         states[::5, 0] = rng.uniform(-1.1, -1.08, len(states[::5]))  # against the wall
         states[1::5, 0] = rng.uniform(0.35, 0.5, len(states[1::5]))  # before the flag
@@ -135,14 +118,11 @@ def test_bins_equal_the_wrappers(kwargs, dims):
     extremes = np.repeat(extremes, 4).reshape(-1, 4)
     states = np.concatenate([random_states(10_000), uniform, extremes])
     indices = np.empty(len(states), dtype=np.int64)
-    bins_of(records_of(CART_POLE_ENV, STATE, states), world_of(env), indices)
+    bins_of(records_of(worlds.CART_POLE_ENV, worlds.STATE, states), world_of(env), indices)
     seen = states.astype(np.float32)
     assert indices.tolist() == [env.observation(state) for state in seen]
     np.testing.assert_array_equal(indices, env.map_observations(seen))
     assert len(np.unique(indices)) > 0.8 * env.observation_space.n
-
-
-# --- Monitor's sums -------------------------------------------------------------------------------
 
 
 @numba.njit
@@ -173,11 +153,11 @@ def test_sums_by_either_rule_and_as_this_python_does(values):
     rules = ((True, compensated_sum), (False, plain_sum), (COMPENSATED_SUM, sum))
     for compensated, add_up in rules:
         sums = np.empty(len(values))
-        running_sums(np.zeros(1, dtype=CART_POLE_ENV)[0], np.array(values), compensated, sums)
+        running_sums(
+            np.zeros(1, dtype=worlds.CART_POLE_ENV)[0], np.array(values), compensated, sums
+        )
         assert sums.tolist() == [add_up(values[: i + 1]) for i in range(len(values))]
 
-
-# --- generators ----------------------------------------------------------------------------------
 
 KINDS = (np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox)
 

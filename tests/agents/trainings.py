@@ -1,11 +1,13 @@
 """One table of agents, each with settings other than its own, and what can be compared of them."""
 
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
 from rl_yardstick.agents.common.schedules import ExponentialSchedule
 
 LAKE, COINS, SEGMENTS = "FrozenLake-v1", "BernoulliBandit-v0", "SegmentBandit-v0"
@@ -56,6 +58,30 @@ AGENTS = {  # where each is tried, and with which settings
     "mabwiser_thompson": (COINS, {}),
     "mabwiser_linucb": (SEGMENTS, {}),
 }
+
+
+class Plain(BaseCallback):
+    """Has to be asked after each step; counts the episodes that end there."""
+
+    ended = ()
+
+    def _on_step(self):
+        self.ended += (int(sum(self.locals["dones"])),)
+        return True
+
+
+class Every(BlockCallback):
+    """Does something on every so many calls, and lets blocks be no longer than that."""
+
+    def __init__(self, calls, do=lambda model: None):
+        super().__init__()
+        self.calls, self.do = calls, do
+
+    def horizon(self):
+        return Horizon(calls=calls_until_multiple(self.n_calls, self.calls))
+
+    def _on_step(self):
+        return self.n_calls % self.calls != 0 or self.do(self.model) is not False
 
 
 def environment(env_id, n_envs=1, seed=3, wrapper=None, folder=None, **env_kwargs):

@@ -11,17 +11,9 @@ from rl_yardstick.diagnosis.faults import FAULTS, Finding
 from rl_yardstick.diagnosis.probe_worlds import Record, World
 from rl_yardstick.diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, register_class
 from rl_yardstick.diagnosis.target_probes import watkins_table
-from tests.diagnosis import planted_classes
-from tests.diagnosis.planted_tables import (
-    from_memory,
-    number,
-    one_step,
-    preferences,
-    several_steps,
-)
+from tests.diagnosis import planted
 
-q_learning, sarsa = partial(one_step, target="max"), partial(one_step, target="next")
-
+q_learning, sarsa = (partial(planted.one_step, target=target) for target in ("max", "next"))
 
 QUICK = {"policy_kwargs": {"net_arch": []}, "learning_rate": 0.03, "batch_size": 32}
 QUICK |= {"target_update_interval": 10, "learning_starts": 10, "train_freq": 1}
@@ -44,8 +36,6 @@ def of_class(name):
     return subject
 
 
-# --- what is found --------------------------------------------------------------------------------
-
 OF_TABLES = {  # the fault: what has it, what that claims to be, and the probe that sees it
     "bootstraps-at-terminal": (q_learning, "q_learning", target_probes.probe_ends),
     "discount-twice": (q_learning, "q_learning", target_probes.probe_discount),
@@ -58,13 +48,13 @@ OF_TABLES = {  # the fault: what has it, what that claims to be, and the probe t
     "not-reproducible": (sarsa, "sarsa", agent_probes.probe_seeds),
     "schedule-backwards": (q_learning, "q_learning", agent_probes.probe_exploration),
     "schedule-constant": (q_learning, "q_learning", agent_probes.probe_exploration),
-    "shared-buffer": (from_memory, "q_learning", target_probes.probe_copies),
-    "stale-buffer": (from_memory, "q_learning", target_probes.probe_age),
-    "n-step-return": (several_steps, "sarsa", target_probes.probe_n_steps),
+    "shared-buffer": (planted.from_memory, "q_learning", target_probes.probe_copies),
+    "stale-buffer": (planted.from_memory, "q_learning", target_probes.probe_age),
+    "n-step-return": (planted.several_steps, "sarsa", target_probes.probe_n_steps),
     "traces, never-cut": (q_learning, "q_learning", target_probes.probe_traces),
     "traces, lambda-alone": (sarsa, "sarsa", target_probes.probe_traces),
     "traces, kept-across-episodes": (sarsa, "sarsa", target_probes.probe_traces),
-    "advantage-sign": (preferences, "actor_critic", agent_probes.probe_choice),
+    "advantage-sign": (planted.preferences, "actor_critic", agent_probes.probe_choice),
 }
 OF_CLASSES = {  # a class: its fault, and the probe that sees it
     "DQNNeverCopies": ("target-never-copied", target_probes.probe_discount),
@@ -78,19 +68,16 @@ OF_CLASSES = {  # a class: its fault, and the probe that sees it
     "PPOEntropy": ("entropy-sign", agent_probes.probe_entropy),
 }
 RIGHT_CLASSES = {
-    "dqn": (
-        target_probes.probe_target_network,
-        target_probes.probe_copies,
-        agent_probes.probe_files,
-    ),
-    "ppo": (target_probes.probe_ratio,),
-}
+    "dqn": [target_probes.probe_target_network, target_probes.probe_copies,
+            agent_probes.probe_files],
+    "ppo": [target_probes.probe_ratio],
+}  # fmt: skip
 
 
 def test_each_fault_is_planted_once():
-    planted = {row.partition(",")[0] for row in OF_TABLES}
-    planted |= {fault for fault, _ in OF_CLASSES.values()}
-    assert {*planted, "no-bootstrap-at-truncation"} == set(FAULTS)  # which SCRIPT has
+    known = {row.partition(",")[0] for row in OF_TABLES}
+    known |= {fault for fault, _ in OF_CLASSES.values()}
+    assert {*known, "no-bootstrap-at-truncation"} == set(FAULTS)  # which SCRIPT has
 
 
 @pytest.mark.parametrize("row", OF_TABLES)
@@ -102,10 +89,10 @@ def test_faults_of_tables_are_named(row):
 
 RIGHT = {
     "Q-learning": (q_learning, "q_learning"),
-    "Expected SARSA": (partial(one_step, target="expected"), "expected_sarsa"),
-    "a memory": (from_memory, "q_learning"),
-    "n steps": (several_steps, "sarsa"),
-    "actor-critic": (preferences, "actor_critic"),
+    "Expected SARSA": (partial(planted.one_step, target="expected"), "expected_sarsa"),
+    "a memory": (planted.from_memory, "q_learning"),
+    "n steps": (planted.several_steps, "sarsa"),
+    "actor-critic": (planted.preferences, "actor_critic"),
 }
 
 
@@ -119,7 +106,7 @@ def test_right_tables_pass_all_probes(row):
 @pytest.mark.parametrize("name", OF_CLASSES)
 def test_faults_of_classes_are_named(name):
     fault, probe = OF_CLASSES[name]
-    accused = of_class(f"{planted_classes.__name__}:{name}")
+    accused = of_class(f"{planted.__name__}:{name}")
     assert {found.fault for found in audit(accused, [0], [probe]) if found.fault} == {fault}
 
 
@@ -129,28 +116,19 @@ def test_right_classes_pass(name):
     assert {found.state for found in audit(of_class(name), [0], RIGHT_CLASSES[name])} == {"ok"}
 
 
-# --- when nothing is said -------------------------------------------------------------------------
+UNSAID = [  # values by the table's and the steps, and what is said of them
+    (lambda values, steps: np.full(2, float(steps)), "did not settle"),
+    (lambda values, steps: values + 3, "4.00 and not 1: no fault known here explains it"),
+]
 
 
-def restless(make_env, seed, gamma, steps):
-    """Values that never come to rest."""
-    agent = q_learning(make_env, seed, gamma, steps)
-    agent.values = lambda obs: np.full(2, float(steps))
-    return agent
+@pytest.mark.parametrize(("shown", "said"), UNSAID)
+def test_no_verdict_where_nothing_is_known(shown, said):
+    def train(make_env, seed, gamma, steps):
+        agent = q_learning(make_env, seed, gamma, steps)
+        agent.values = lambda obs: shown(agent.table[planted.number(obs)], steps)
+        return agent
 
-
-def shifted(make_env, seed, gamma, steps):
-    """Values that no fault explains."""
-    agent = q_learning(make_env, seed, gamma, steps)
-    agent.values = lambda obs: agent.table[number(obs)] + 3
-    return agent
-
-
-@pytest.mark.parametrize(
-    ("train", "said"),
-    [(restless, "did not settle"), (shifted, "4.00 and not 1: no fault known here explains it")],
-)
-def test_no_verdict_where_nothing_is_known(train, said):
     findings = tuple(audit(script(train, "q_learning"), [0], [target_probes.probe_ends]))
     assert [(finding.state, finding.fault) for finding in findings] == [("unsaid", "")]
     assert said in findings[0].text

@@ -10,20 +10,8 @@ from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 
 import rl_yardstick.envs  # noqa: F401 (registers the environments)
-from rl_yardstick.envs.bandits import (
-    BernoulliBandit,
-    GaussianBandit,
-    LinearBandit,
-    ReplayBandit,
-    log_uniformly,
-    read_log,
-)
-from rl_yardstick.envs.known_models import (
-    observations_of_states,
-    success_outcomes,
-    time_limit,
-    transition_model,
-)
+from rl_yardstick.envs import bandits
+from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.wrappers import ScaleReward
 from rl_yardstick.mdp import baseline_return, finite_horizon_optimum, policy_return
 
@@ -34,14 +22,11 @@ def arms_to_pull(n, n_arms):
     return np.random.default_rng(99).integers(n_arms, size=n).tolist()
 
 
-# --- draws ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("drift_std", [0.0, 0.25])
 @pytest.mark.parametrize("given_means", [None, [0.5, 0.5, 0.5]], ids=["redrawn", "given"])
 def test_draws_of_gaussian_bandits(given_means, drift_std):
     drawn = {"n_arms": 3, "mean_loc": 2.5} if given_means is None else {"means": given_means}
-    env = GaussianBandit(**drawn, reward_std=0.7, drift_std=drift_std)
+    env = bandits.GaussianBandit(**drawn, reward_std=0.7, drift_std=drift_std)
     rng, _ = np_random(11)
     env.reset(seed=11)
     for _ in range(2):
@@ -73,7 +58,7 @@ def weighted_sum(weights, context):
 def test_draws_of_linear_bandits(redraws):
     weights = np.random.default_rng(5).standard_normal((4, 9)).tolist()
     arms = {"n_arms": 4, "n_features": 9} if redraws else {"arm_parameters": weights}
-    env = LinearBandit(**arms, reward_std=0.5)
+    env = bandits.LinearBandit(**arms, reward_std=0.5)
     rng, _ = np_random(13)
     shown, _ = env.reset(seed=13)
     for _ in range(2):
@@ -94,11 +79,8 @@ def test_draws_of_linear_bandits(redraws):
         shown, _ = env.reset()
 
 
-# --- what step tells, and when it ends ------------------------------------------------------------
-
-
 def test_each_of_several_best_arms_has_no_regret():
-    env = BernoulliBandit([0.1, 0.7, 0.7])
+    env = bandits.BernoulliBandit([0.1, 0.7, 0.7])
     assert env.reset(seed=0)[1] == {}
     for arm, expected, regret in ((0, 0.1, 0.7 - 0.1), (1, 0.7, 0.0), (2, 0.7, 0.0)):
         info = env.step(arm)[4]
@@ -109,10 +91,10 @@ def test_each_of_several_best_arms_has_no_regret():
 def test_an_episode_ends_after_its_pulls():
     for kwargs, length in (({}, 1000), ({"max_episode_steps": 40, "pulls": 30}, 40)):
         env = gym.make("GaussianBandit-v0", **kwargs)
-        assert time_limit(env) == env.spec.max_episode_steps == length
+        assert known.time_limit(env) == env.spec.max_episode_steps == length
         env.reset(seed=0)
         assert [env.step(0)[2:4] for _ in range(length)][-2:] == [(False, False), (False, True)]
-    assert time_limit(gym.make("GaussianBandit-v0", max_episode_steps=-1)) is None
+    assert known.time_limit(gym.make("GaussianBandit-v0", max_episode_steps=-1)) is None
 
 
 def test_feedback_is_due_at_the_end_of_each_batch_and_of_the_episode():
@@ -123,23 +105,20 @@ def test_feedback_is_due_at_the_end_of_each_batch_and_of_the_episode():
         assert [i for i in range(12) if due[i]] == [4, 9, 11]
 
 
-# --- known figures --------------------------------------------------------------------------------
-
-
 def test_what_a_pooled_test_of_segments_loses_is_exact():
     env = gym.make("SegmentBandit-v0")
-    model, horizon = transition_model(env), time_limit(env)
+    model, horizon = known.transition_model(env), known.time_limit(env)
     best = finite_horizon_optimum(model, horizon).start_value / horizon
     random = policy_return(model, np.full((2, 3), 1 / 3), horizon).expected_return / horizon
     assert baseline_return(model, horizon) / horizon == pytest.approx(0.117, abs=1e-12)
     assert best == pytest.approx(0.159, abs=1e-12)
     assert (best - random) * 10_000 == pytest.approx(653.3, abs=0.1)
     env = ScaleReward(gym.make("BernoulliBandit-v0"), 2)  # of coins
-    model = transition_model(env)
+    model = known.transition_model(env)
     assert (model.n_states, model.n_outcomes, model.terminated.any()) == (1, 2, False)
     assert model.expected_reward.tolist() == [[0.4, 1.0, 1.5]]
-    assert observations_of_states(env).tolist() == [0]
-    assert success_outcomes(env) is None
+    assert known.observations_of_states(env).tolist() == [0]
+    assert known.success_outcomes(env) is None
 
 
 @pytest.fixture
@@ -152,11 +131,8 @@ def write(tmp_path):
     return written
 
 
-# --- reading logs ---------------------------------------------------------------------------------
-
-
 def test_a_log_with_a_context_of_text():
-    data = read_log(LOG)
+    data = bandits.read_log(LOG)
     assert (data.source, len(data), data.n_arms) == (str(LOG), 7, 2)
     assert (data.context_names, data.categories) == (("segment",), ("casual", "core"))
     assert data.contexts[:, 0].tolist() == [1, 0, 0, 1, 0, 1, 0]
@@ -185,7 +161,7 @@ LOGS = {  # the text, names, contexts and arms; an observation space, and the ob
 @pytest.mark.parametrize("name", LOGS)
 def test_logs_of_any_form(name, write):
     text, names, contexts, arms, space, observations = LOGS[name]
-    data = read_log(write(text))
+    data = bandits.read_log(write(text))
     assert (data.context_names, data.contexts.tolist()) == (names, contexts)
     assert (data.arms.tolist(), data.n_arms, data.propensities) == (arms, max(arms) + 1, None)
     assert data.observation_space == space
@@ -216,12 +192,9 @@ def test_mistakes_in_a_log_are_named_with_their_row(tmp_path, text, message):
     path = tmp_path / "log.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ValueError, match=message) as refused:
-        read_log(path)
+        bandits.read_log(path)
     assert str(path) in str(refused.value)
     assert "\n" not in str(refused.value)
-
-
-# --- writing logs ---------------------------------------------------------------------------------
 
 
 UNIFORM = [  # an environment, its settings, the names of its contexts
@@ -233,8 +206,8 @@ UNIFORM = [  # an environment, its settings, the names of its contexts
 @pytest.mark.parametrize(("env_id", "kwargs", "names"), UNIFORM)
 def test_a_uniform_log_holds_what_the_environment_gave(env_id, kwargs, names, tmp_path):
     path, env = tmp_path / "log.csv", gym.make(env_id, **kwargs)
-    log_uniformly(gym.make(env_id, **kwargs), 100, seed=3, path=path)
-    data, n_arms = read_log(path), int(env.action_space.n)
+    bandits.log_uniformly(gym.make(env_id, **kwargs), 100, seed=3, path=path)
+    data, n_arms = bandits.read_log(path), int(env.action_space.n)
     assert data.context_names == names
     assert set(data.propensities.tolist()) == {1 / n_arms}
     shown, (context, _) = data.observations(env.observation_space), env.reset(seed=3)
@@ -246,25 +219,15 @@ def test_a_uniform_log_holds_what_the_environment_gave(env_id, kwargs, names, tm
             context, _ = env.reset()
 
 
-# --- replay ---------------------------------------------------------------------------------------
-
-
 def test_replay_by_hand(tmp_path):
     with pytest.raises(ValueError, match=r"cannot read .*missing\.csv: No such file or directory"):
         gym.make("ReplayBandit-v0", log=str(tmp_path / "missing.csv"))
     env = gym.make("ReplayBandit-v0", log=str(LOG))
     assert (env.observation_space, env.action_space) == (spaces.Discrete(2), spaces.Discrete(2))
-    assert (time_limit(env), transition_model(env)) == (7, None)
+    assert (known.time_limit(env), known.transition_model(env)) == (7, None)
     # Context after the step, reward, matched, matched pulls so far; the arm pulled is always 0.
-    expected = [
-        (0, 1.0, True, 1),
-        (0, 0.0, False, 1),
-        (1, 1.0, True, 2),
-        (0, 0.0, False, 2),
-        (1, 0.0, False, 2),
-        (0, 0.0, True, 3),
-        (0, 0.25, True, 4),
-    ]
+    expected = [(0, 1.0, True, 1), (0, 0.0, False, 1), (1, 1.0, True, 2), (0, 0.0, False, 2)]
+    expected += [(1, 0.0, False, 2), (0, 0.0, True, 3), (0, 0.25, True, 4)]
     for _ in range(2):
         assert env.reset(seed=0) == (1, {})
         for step, (context, reward, matched, matched_pulls) in enumerate(expected):
@@ -280,7 +243,7 @@ def test_logs_that_were_not_uniform_are_refused(write):
         ("arm,reward,propensity\n0,1,0.5\n1,1,0.4\n", "the propensity of pull 2 is 0.4, not 0.5"),
     ):
         with pytest.raises(ValueError, match=message):
-            ReplayBandit(write(text))
+            bandits.ReplayBandit(write(text))
     # Arms that were never pulled are known from the propensities.
     log = write("arm,reward,propensity\n0,1,0.2\n2,0,0.2\n")
-    assert ReplayBandit(log).action_space == spaces.Discrete(5)
+    assert bandits.ReplayBandit(log).action_space == spaces.Discrete(5)

@@ -23,9 +23,6 @@ def walk(env, letters):
     return [[step[i] for step in steps] for i in (0, 1, 2, 4)]
 
 
-# --- maps -----------------------------------------------------------------------------------------
-
-
 def test_a_map_is_read_from_rows_text_and_files(tmp_path):
     path, marked = tmp_path / "map.txt", tmp_path / "marked.txt"
     path.write_text("\n".join(ROWS))
@@ -84,9 +81,6 @@ def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
     assert WarehouseEnv(desc=["G..S.G", "......"]).shortest_path_length == 2
 
 
-# --- steps worked by hand -------------------------------------------------------------------------
-
-
 def test_slip_goes_to_both_sides_in_the_stated_order():
     middle = WarehouseEnv(desc=["...", ".S.", "..G"], slip=0.2).P[4]
     reached = {UP: (1, 3, 5), DOWN: (7, 3, 5), LEFT: (3, 1, 7), RIGHT: (5, 1, 7)}
@@ -122,9 +116,6 @@ def test_what_is_observed():
         assert np.asarray(first).tolist() == seen[0]
         assert observation == "discrete" or first.dtype == batch.dtype == np.float32
         assert np.asarray(walk(env, "DR")[0][-1]).tolist() == seen[1]
-
-
-# --- any map --------------------------------------------------------------------------------------
 
 
 @st.composite
@@ -201,9 +192,6 @@ def test_any_map_that_can_be_solved_follows_the_rules(kind, data, slip, random_s
             position, collected = env.reset()[1]["position"], set()
 
 
-# --- random warehouses ----------------------------------------------------------------------------
-
-
 def test_a_seed_names_a_map_for_good():
     expected = ["...##G", "#...#.", "#.....", "..##.#", "......", "S###.#"]
     assert random_warehouse(6, 0.4, 7) == expected
@@ -231,16 +219,12 @@ def test_an_episode_is_limited_by_ten_shortest_ways_unless_it_is_said_otherwise(
     assert str(again) == str(env)
 
 
-# --- mazes that change ----------------------------------------------------------------------------
-
 CHANGING = {"maze": "blocking", "changed": True}
 
 
 def test_shortest_ways_of_the_mazes():
-    found = [
-        DynaMazeEnv(maze=maze, changed=changed).shortest_path_length
-        for maze, changed in itertools.product(("blocking", "shortcut"), (False, True))
-    ]
+    mazes = itertools.product(("blocking", "shortcut"), (False, True))
+    found = [DynaMazeEnv(maze=m, changed=changed).shortest_path_length for m, changed in mazes]
     assert found == [10, 16, 16, 10]
     env = DynaMazeEnv()
     assert (env.shortest_path_length, env.transition_model().n_states) == (14, 54)

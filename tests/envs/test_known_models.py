@@ -7,40 +7,13 @@ import numpy as np
 import pytest
 from gymnasium.envs.classic_control import MountainCarEnv
 from gymnasium.utils.seeding import np_random
-from gymnasium.wrappers import (
-    ClipReward,
-    FlattenObservation,
-    RecordEpisodeStatistics,
-    TimeAwareObservation,
-    TimeLimit,
-    TransformReward,
-)
 from stable_baselines3.common.monitor import Monitor
 
 import rl_yardstick.envs  # noqa: F401 (registers the environments)
 import train
-from rl_yardstick.envs.brackets import (
-    OptimumBracket,
-    known_entries,
-    may_have_bracket,
-    optimum_bracket,
-    upper_is_proven,
-)
-from rl_yardstick.envs.known_models import (
-    model_check,
-    observations_of_states,
-    success_outcomes,
-    time_limit,
-    transition_model,
-)
+from rl_yardstick.envs import brackets, wrappers
+from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.layout import action_names, grid_layout, state_name
-from rl_yardstick.envs.wrappers import (
-    DiscretizeObservation,
-    FlattenToDiscrete,
-    OneHotObservation,
-    ScaleReward,
-    TerminationReward,
-)
 
 EIGHT = {"map_name": "8x8", "success_rate": 0.6, "reward_schedule": (3, -2, -0.1)}
 WORLDS = {
@@ -74,7 +47,11 @@ def first_above(probabilities, uniform):
 
 def assert_replays(env, steps=500):
     """Predict every start and step from the model and a generator of the same seed."""
-    model, base, observations = transition_model(env), env.unwrapped, observations_of_states(env)
+    model, base, observations = (
+        known.transition_model(env),
+        env.unwrapped,
+        known.observations_of_states(env),
+    )
     uniform = np_random(3)[0].random
     first, _ = env.reset(seed=3)
     state = first_above(model.initial, uniform())
@@ -103,14 +80,18 @@ def test_the_model_replays_the_environment(name):
 
 
 def replaced(env):
-    inner = TerminationReward(ScaleReward(Monitor(env), 0.01), reward=-0.7)
-    return ScaleReward(RecordEpisodeStatistics(inner, stats_key="stats"), -3.0)
+    inner = wrappers.TerminationReward(wrappers.ScaleReward(Monitor(env), 0.01), reward=-0.7)
+    return wrappers.ScaleReward(
+        gym.wrappers.RecordEpisodeStatistics(inner, stats_key="stats"), -3.0
+    )
 
 
 REWARDED = {
     "replaced": replaced,
-    "clipped": lambda env: ScaleReward(ClipReward(ScaleReward(env, 0.1), -0.5, 0.3), 0.7),
-    "clipped below": lambda env: ClipReward(env, 0.1, None),
+    "clipped": lambda env: wrappers.ScaleReward(
+        gym.wrappers.ClipReward(wrappers.ScaleReward(env, 0.1), -0.5, 0.3), 0.7
+    ),
+    "clipped below": lambda env: gym.wrappers.ClipReward(env, 0.1, None),
 }
 
 
@@ -121,18 +102,19 @@ def test_what_wrappers_do_to_rewards_is_folded_in(wrap):
 
 def test_what_wrappers_do_to_observations_is_folded_in():
     lake, position = make("FrozenLake"), gym.make("Warehouse-v0", observation="position")
-    assert_replays(OneHotObservation(FlattenToDiscrete(lake)), steps=200)
-    assert_replays(DiscretizeObservation(position, bins=4), steps=200)
-    np.testing.assert_array_equal(observations_of_states(OneHotObservation(lake)), np.eye(16))
+    assert_replays(wrappers.OneHotObservation(wrappers.FlattenToDiscrete(lake)), steps=200)
+    assert_replays(wrappers.DiscretizeObservation(position, bins=4), steps=200)
+    seen = known.observations_of_states(wrappers.OneHotObservation(lake))
+    assert seen.tolist() == np.eye(16).tolist()
     # Where it is not known what is seen, the model is known all the same.
-    assert observations_of_states(TimeAwareObservation(lake)) is None
+    assert known.observations_of_states(gym.wrappers.TimeAwareObservation(lake)) is None
 
 
 def test_what_wrappers_make_of_drawn_rewards():
     env = gym.make("MaximizationBias-v0", reward_std=2)
-    assert transition_model(ScaleReward(env, 3)).reward_variance[1, 0, 0] == 36
-    assert not transition_model(TerminationReward(env, -5)).reward_variance.any()
-    assert transition_model(ClipReward(env, -1, 1)) is None
+    assert known.transition_model(wrappers.ScaleReward(env, 3)).reward_variance[1, 0, 0] == 36
+    assert not known.transition_model(wrappers.TerminationReward(env, -5)).reward_variance.any()
+    assert known.transition_model(gym.wrappers.ClipReward(env, -1, 1)) is None
 
 
 class Anything(gym.Wrapper):
@@ -140,41 +122,37 @@ class Anything(gym.Wrapper):
 
 
 UNKNOWN = {
-    "function": lambda env: TransformReward(env, lambda reward: reward),
-    "on_truncation": lambda env: TerminationReward(env, -10, on_truncation=True),
-    "inside": lambda env: Monitor(Anything(env)),
-}
+    "function": lambda: gym.wrappers.TransformReward(make("FrozenLake"), lambda reward: reward),
+    "on_truncation": lambda: wrappers.TerminationReward(make("Taxi"), -10, on_truncation=True),
+    "inside": lambda: Monitor(Anything(make("FrozenLake"))),
+    "CartPole": lambda: gym.make("CartPole-v1"),
+    "fickle": lambda: gym.make("Taxi-v4", fickle_passenger=True),
+    "Gaussian": lambda: gym.make("GaussianBandit-v0"),
+    "changing": lambda: gym.make(
+        "DynaMaze-v0", maze="blocking", changed=True, change_after_steps=9),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("wrap", UNKNOWN)
-def test_unknown_wrappers_hide_the_model(wrap):
-    env = UNKNOWN[wrap](gym.make("FrozenLake-v1"))
-    assert transition_model(env) is success_outcomes(env) is model_check(env) is None
-
-
-def test_environments_without_a_model():
-    changing = {"maze": "blocking", "changed": True, "change_after_steps": 9}
-    for env in (
-        gym.make("CartPole-v1"),
-        gym.make("Taxi-v4", fickle_passenger=True),
-        gym.make("GaussianBandit-v0"),
-        gym.make("DynaMaze-v0", **changing),
-    ):
-        for known in (transition_model, success_outcomes, observations_of_states, model_check):
-            assert known(env) is None
+@pytest.mark.parametrize("what", UNKNOWN)
+def test_nothing_is_told_where_the_model_is_not_known(what):
+    env = UNKNOWN[what]()
+    tellers = known.transition_model, known.success_outcomes, known.model_check
+    assert [teller(env) for teller in tellers] == [None] * 3
+    is_seen = what in {"on_truncation", "function"}
+    assert is_seen or known.observations_of_states(env) is None
 
 
 def test_time_limits_and_models_that_are_none():
     for env_id, limit in (("MineMaze-v0", 100), ("CliffWalking-v1", None)):
         env = gym.make(env_id)
-        assert time_limit(env) == limit
-        assert time_limit(Monitor(TimeLimit(env, 5000))) == (limit or 5000)
-        assert time_limit(TimeLimit(ScaleReward(env, 0.5), 7)) == 7
+        assert known.time_limit(env) == limit
+        assert known.time_limit(Monitor(gym.wrappers.TimeLimit(env, 5000))) == (limit or 5000)
+        assert known.time_limit(gym.wrappers.TimeLimit(wrappers.ScaleReward(env, 0.5), 7)) == 7
     env = make("FrozenLake")
     env.unwrapped.P[3][1] = [(0.5, 0, 0.0, False)]
-    assert transition_model(env) is None
+    assert known.transition_model(env) is None
     line = "state 3, action 1 has probabilities that do not sum to one"
-    assert model_check(env).refusal == f"the environment's P is no model: {line}"
+    assert known.model_check(env).refusal == f"the environment's P is no model: {line}"
 
 
 SUCCESSES = {
@@ -188,11 +166,9 @@ SUCCESSES = {
 
 @pytest.mark.parametrize("name", SUCCESSES)
 def test_the_transitions_that_count_as_success(name):
-    found = np.argwhere(success_outcomes(make(name))).tolist()
+    found = np.argwhere(known.success_outcomes(make(name))).tolist()
     assert [(state, action) for state, action, _ in found] == SUCCESSES[name]
 
-
-# --- states on a map ------------------------------------------------------------------------------
 
 UP, DOWN, LEFT, RIGHT = (-1, 0), (1, 0), (0, -1), (0, 1)
 LAYOUTS = {
@@ -205,7 +181,10 @@ LAYOUTS = {
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_moves_lead_where_the_layout_says(name):
     env = make(name)
-    layout, model = grid_layout(gym.wrappers.RecordEpisodeStatistics(env)), transition_model(env)
+    layout, model = (
+        grid_layout(gym.wrappers.RecordEpisodeStatistics(env)),
+        known.transition_model(env),
+    )
     first, names, moves = LAYOUTS[name]
     assert (layout.rows[0], layout.names, layout.moves) == (first, names, moves)
     assert layout.n_states == model.n_states
@@ -249,10 +228,9 @@ def test_layers_other_layouts_and_names():
     assert state_name(gym.make("RiverSwim-v0"), None, 3) == "state 3"
 
 
-# --- brackets of optima: claimed for what they were worked out for alone --------------------------
-
 DOCUMENT = Path(train.__file__).parent / "docs" / "continuous.md"
-ENTRIES = {entry["id"]: entry for limits in known_entries().values() for entry in limits.values()}
+KNOWN = brackets.known_entries().values()
+ENTRIES = {entry["id"]: entry for limits in KNOWN for entry in limits.values()}
 
 
 @pytest.mark.parametrize("name", ENTRIES)
@@ -263,10 +241,10 @@ def test_a_bracket_is_claimed_of_an_environment_as_it_is(name):
         env.reset(seed=0)
         env.step(env.action_space.sample())  # it may have been played before
         is_proven = name != "Acrobot-v1"
-        assert optimum_bracket(env) == OptimumBracket(low, high, base, is_proven)
-        assert optimum_bracket(FlattenObservation(env)) is not None
-    assert may_have_bracket(name)
-    assert upper_is_proven(name) is is_proven
+        assert brackets.optimum_bracket(env) == brackets.OptimumBracket(low, high, base, is_proven)
+        assert brackets.optimum_bracket(gym.wrappers.FlattenObservation(env)) is not None
+    assert brackets.may_have_bracket(name)
+    assert brackets.upper_is_proven(name) is is_proven
     assert base < low < entry["played"]["mean"] <= high
     apart = (high - low) / (low - base)
     assert apart < (0.06 if name == "Acrobot-v1" else 0.03)
@@ -286,7 +264,7 @@ OTHERS = {
     "limit": lambda: gym.make("CartPole-v1", max_episode_steps=400),
     "attribute": lambda: changed("CartPole-v1", gravity=5.0),
     "own step": lambda: changed("MountainCar-v0", step=MountainCarEnv().step),
-    "scaled rewards": lambda: ScaleReward(gym.make("CartPole-v1"), 2.0),
+    "scaled rewards": lambda: wrappers.ScaleReward(gym.make("CartPole-v1"), 2.0),
     "unknown wrapper": lambda: Anything(gym.make("CartPole-v1")),
 }
 
@@ -294,4 +272,4 @@ OTHERS = {
 @pytest.mark.parametrize("what", OTHERS)
 def test_none_is_claimed_of_anything_else(what):
     with OTHERS[what]() as env:
-        assert optimum_bracket(env) is None
+        assert brackets.optimum_bracket(env) is None

@@ -8,46 +8,32 @@ import pytest
 from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
 import rl_yardstick.envs  # noqa: F401 (registers the environments)
+from rl_yardstick import mdp
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.compiled.worlds import NotCompilable, compile_envs
+from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.blackjack_model import blackjack_observations, natural_state, state_of
-from rl_yardstick.envs.known_models import (
-    action_masks_of_states,
-    observations_of_states,
-    success_outcomes,
-    time_limit,
-    transition_model,
-)
 from rl_yardstick.envs.textbook.racetrack import LEFT_TRACK
 from rl_yardstick.envs.wrappers import FlattenToDiscrete
-from rl_yardstick.mdp import (
-    finite_horizon_optimum,
-    policy_iteration,
-    policy_return,
-    value_iteration,
-)
 
 
 def model_of(env_id, **kwargs):
-    return transition_model(gym.make(env_id, **kwargs))
+    return known.transition_model(gym.make(env_id, **kwargs))
 
 
 def optimum_of(env_id, **kwargs):
-    limit = time_limit(gym.make(env_id, **kwargs))
-    return finite_horizon_optimum(model_of(env_id, **kwargs), limit).start_value
+    limit = known.time_limit(gym.make(env_id, **kwargs))
+    return mdp.finite_horizon_optimum(model_of(env_id, **kwargs), limit).start_value
 
 
 def optimal_values(env_id, **kwargs):
-    return policy_iteration(model_of(env_id, **kwargs), 1.0).values
+    return mdp.policy_iteration(model_of(env_id, **kwargs), 1.0).values
 
 
 def walk(env, actions):
     """States and rewards of a walk, and whether its last step terminated."""
     steps = [(*env.step(action)[:3], env.s) for action in actions]
     return [step[3] for step in steps], [step[1] for step in steps], steps[-1][2]
-
-
-# --- RandomWalk and ShortCorridor -----------------------------------------------------------------
 
 
 def test_values_of_short_walks_are_those_of_the_book():
@@ -61,15 +47,12 @@ def test_values_of_short_walks_are_those_of_the_book():
 def test_the_second_state_of_the_corridor_alone_is_reversed():
     # Example 13.1: v1 = 1 + p v2 + (1-p) v1, v2 = 1 + p v1 + (1-p) v3, v3 = 1 + (1-p) v2.
     p, env = 0.59, gym.make("ShortCorridor-v0").unwrapped
-    found = policy_return(env.transition_model(), np.tile([1 - p, p], (4, 1)), 20_000)
+    found = mdp.policy_return(env.transition_model(), np.tile([1 - p, p], (4, 1)), 20_000)
     assert found.expected_return == pytest.approx(-(4 - 2 * p) / (p * (1 - p)), rel=1e-9)
     env.reset(seed=0)
     states = [0, 1, 0, 1, 2, 1, 0, 0, 1]
     assert walk(env, [0, 1, 1, 1, 0, 0, 1, 0, 1]) == (states, [-1.0] * 9, False)
     assert walk(env, [0, 1])[1:] == ([-1.0, -1.0], True)
-
-
-# --- WindyGridworld -------------------------------------------------------------------------------
 
 
 def next_by_hand(state, down, right, gust):
@@ -97,9 +80,6 @@ def test_the_shortest_ways_and_every_step_in_the_wind():
     assert (model.reward[np.arange(70) != 37] == -1).all()
 
 
-# --- GamblersProblem, MaximizationBias, RiverSwim and DeepSea -------------------------------------
-
-
 def test_values_of_the_gambler_are_those_of_bold_play():
     values = optimal_values("GamblersProblem-v0")
     # Dubins and Savage (1965): staking all that may be staked is optimal on an unfair coin.
@@ -117,31 +97,31 @@ def test_a_stake_that_is_too_large_is_not_taken():
     reached = [set(model.next_state[30, action].tolist()) for action in (31, 0, 30)]
     assert reached == [{30}, {30}, {0, 60}]
     env = gym.make("GamblersProblem-v0")
-    masks = action_masks_of_states(env)
+    masks = known.action_masks_of_states(env)
     assert masks[30].tolist() == [True] * 31 + [False] * 20
     assert masks[90].sum() == 11
     np.testing.assert_allclose(env.unwrapped.initial_state_distrib[1:100], 1 / 99)
     assert gym.make("GamblersProblem-v0", start_capital=7).reset()[0] == 7
-    assert success_outcomes(env)[50, 50].tolist() == [True, False]
+    assert known.success_outcomes(env)[50, 50].tolist() == [True, False]
 
 
 def test_right_is_the_optimum_of_maximization_bias():
     model = model_of("MaximizationBias-v0", n_actions=5)
-    assert value_iteration(model, 1.0).policy[2] == 1
-    found = [policy_return(model, np.full(4, action), 100) for action in (0, 1)]
+    assert mdp.value_iteration(model, 1.0).policy[2] == 1
+    found = [mdp.policy_return(model, np.full(4, action), 100) for action in (0, 1)]
     assert [result.expected_return for result in found] == [-0.1, 0.0]
     assert [result.return_variance for result in found] == [1.0, 0.0]
     assert [result.expected_length for result in found] == [2.0, 1.0]
     # In A two actions are allowed, and the others repeat them.
     assert model.next_state[2, :, 0].tolist() == [1, 3, 1, 3, 1]
-    masks = action_masks_of_states(gym.make("MaximizationBias-v0", n_actions=5))
+    masks = known.action_masks_of_states(gym.make("MaximizationBias-v0", n_actions=5))
     assert masks[2].tolist() == [True, True, False, False, False]
     assert masks[1].all()
 
 
 def test_swimming_right_for_ever_earns_what_its_chain_says():
     model = model_of("RiverSwim-v0")
-    policy = value_iteration(model, 0.99).policy
+    policy = mdp.value_iteration(model, 0.99).policy
     assert policy.tolist() == [1] * 6
     # A birth-death chain: the stationary distribution goes up by up/down from state to state.
     up = np.array([0.6, 0.35, 0.35, 0.35, 0.35])
@@ -149,7 +129,7 @@ def test_swimming_right_for_ever_earns_what_its_chain_says():
     weights = np.concatenate([[1.0], np.cumprod(up / down)])
     gain = weights[-1] / weights.sum()
     assert gain == pytest.approx(0.4286, abs=5e-5)
-    earned = [policy_return(model, policy, n).expected_return for n in (1_000, 2_000)]
+    earned = [mdp.policy_return(model, policy, n).expected_return for n in (1_000, 2_000)]
     assert (earned[1] - earned[0]) / 1_000 == pytest.approx(gain, rel=1e-9)
 
 
@@ -163,13 +143,11 @@ def test_the_treasure_is_worth_99_hundredths(size, map_seed):
     slippery = optimum_of("DeepSea-v0", deterministic=False, **kwargs)
     assert slippery == pytest.approx(best, abs=1e-12)
     # From the top left, to the right: one row below, in the next column or in the same.
-    model = transition_model(gym.make("DeepSea-v0", deterministic=False, **kwargs))
+    model = known.transition_model(gym.make("DeepSea-v0", deterministic=False, **kwargs))
     right = 1 if map_seed is None else int(model.prob[0, 1, 1] > 0)
     assert model.next_state[0, right].tolist() == [size + 1, size]
     assert model.prob[0, right].tolist() == [1 - 1 / size, 1 / size]
 
-
-# --- Racetrack ------------------------------------------------------------------------------------
 
 COAST, FASTER_UP, SLOWER_UP, FASTER_RIGHT, SLOWER_RIGHT = 4, 7, 1, 5, 3
 
@@ -226,15 +204,11 @@ def test_without_noise_the_race_takes_ten_steps_and_more():
     assert optimum_of("Racetrack-v0", noise=0) == pytest.approx(-52 / 5)
 
 
-# --- JacksCarRental -------------------------------------------------------------------------------
-
 N = 21
 
 
 def test_the_exercise_adds_a_free_move_and_fees_for_parking():
-    example, exercise = (
-        gym.make("JacksCarRental-v0", variant=variant) for variant in ("example", "exercise")
-    )
+    example, exercise = (gym.make("JacksCarRental-v0", variant=v) for v in ("example", "exercise"))
     one, two, moved = np.ogrid[:N, :N, -5:6]
     possible = (moved <= one) & (-moved <= two)
     left, right = np.minimum(one - moved, 20), np.minimum(two + moved, 20)
@@ -243,15 +217,15 @@ def test_the_exercise_adds_a_free_move_and_fees_for_parking():
     np.testing.assert_array_equal(models[0].prob, models[1].prob)
     found = (models[1].expected_reward - models[0].expected_reward).reshape(N, N, 11)
     np.testing.assert_allclose(found[possible], added[possible], atol=1e-9)
-    assert np.array_equal(action_masks_of_states(example).reshape(N, N, 11), possible)
+    assert np.array_equal(known.action_masks_of_states(example).reshape(N, N, 11), possible)
     # More cars than there are cannot be moved: 2 and 0 of them here.
     for array in (models[0].prob, models[0].reward):
         np.testing.assert_array_equal(array[2 * N, [10, 0]], array[2 * N, [7, 5]])
 
 
 def test_optimal_values_and_policy_are_those_of_figure_4_2():
-    masks = action_masks_of_states(gym.make("JacksCarRental-v0"))
-    plan = policy_iteration(model_of("JacksCarRental-v0"), 0.9, mask=masks)
+    masks = known.action_masks_of_states(gym.make("JacksCarRental-v0"))
+    plan = mdp.policy_iteration(model_of("JacksCarRental-v0"), 0.9, mask=masks)
     values, moves = plan.values.reshape(N, N), plan.policy.reshape(N, N) - 5
     assert (values[20, 20], values[0, 0]) == pytest.approx((636.99, 421.41), abs=0.005)
     # The borders of the figure: nothing to move with few cars, five from a full first place.
@@ -262,9 +236,6 @@ def test_optimal_values_and_policy_are_those_of_figure_4_2():
     assert re.search(r"cars at the \w+ place +2 of 20  =+\n", env.render())
     env.step(7)
     assert env.render().startswith("moved +2\n")
-
-
-# --- what they share ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -293,26 +264,26 @@ def test_drawn_rewards_have_the_models_mean_and_variance(env_id, kwargs, state, 
     assert (np.abs(counts - n * chances) <= 5 * np.sqrt(n * chances) + 3).all()
 
 
-# --- Blackjack ------------------------------------------------------------------------------------
-
 SUTTON, NATURAL = {"sab": True}, {"sab": False, "natural": True}
 PUBLISHED = [(SUTTON, -0.0431), (NATURAL, -0.0257), ({"sab": False, "natural": False}, -0.0466)]
 STICK, HIT = 0, 1
 
 
 def blackjack(rules):
-    return transition_model(FlattenToDiscrete(gym.make("Blackjack-v1", **rules)))
+    return known.transition_model(FlattenToDiscrete(gym.make("Blackjack-v1", **rules)))
 
 
 def test_the_optimum_is_the_one_that_is_published():
     for rules, published in PUBLISHED:
         model = blackjack(rules)
-        found = policy_return(model, value_iteration(model, 1.0).policy, None).expected_return
+        found = mdp.policy_return(
+            model, mdp.value_iteration(model, 1.0).policy, None
+        ).expected_return
         assert found == pytest.approx(published, abs=5e-5)
 
 
 def test_the_policy_is_that_of_figure_5_2():
-    policy = value_iteration(blackjack(SUTTON), 1.0).policy
+    policy = mdp.value_iteration(blackjack(SUTTON), 1.0).policy
     # Without a usable ace stick from this sum on, by the dealer's card: ace, 2, 3, ..., 10.
     hard = [17, 13, 13, 12, 12, 12, 17, 17, 17, 17]
     soft = [19, 18, 18, 18, 18, 18, 18, 18, 19, 19]
@@ -327,11 +298,11 @@ def test_the_policy_is_that_of_figure_5_2():
 def test_a_natural_looks_as_any_21_does_and_wins_are_successes():
     seen = blackjack_observations()
     assert seen[natural_state(10)].tolist() == seen[state_of(21, 10, True)].tolist() == [21, 10, 1]
-    flat = observations_of_states(FlattenToDiscrete(gym.make("Blackjack-v1")))
+    flat = known.observations_of_states(FlattenToDiscrete(gym.make("Blackjack-v1")))
     assert flat[:704].tolist() == list(range(704))
     assert flat[natural_state(3)] == state_of(21, 3, True)
     env = gym.make("Blackjack-v1", natural=True, sab=False)
-    model, wins = transition_model(env), success_outcomes(env)
+    model, wins = known.transition_model(env), known.success_outcomes(env)
     assert set(model.reward[wins].tolist()) == {1.0, 1.5}
     # With this rule a natural that beats the dealer's 20 pays more, and no other hand.
     paid = (model.reward == 1.5) & (model.prob > 0)
@@ -345,18 +316,15 @@ class Cheating(BlackjackEnv):
 def test_another_blackjack_is_not_believed_and_none_is_compiled():
     changed = BlackjackEnv()
     changed.step = lambda action: None
-    assert transition_model(Cheating()) is transition_model(changed) is None
+    assert known.transition_model(Cheating()) is known.transition_model(changed) is None
     agent = load_algorithm("qlearning")(env=FlattenToDiscrete(gym.make("Blackjack-v1")))
     with pytest.raises(NotCompilable, match="does not continue from the state"):
         compile_envs(agent.env)
 
 
-# --- what they hide: Tiger ------------------------------------------------------------------------
-
-
 def chances(env_id, state, action, **kwargs):
     """What may come of an action: the chance of each state, by its number."""
-    model = transition_model(gym.make(env_id, **kwargs))
+    model = known.transition_model(gym.make(env_id, **kwargs))
     found = np.zeros(model.n_states)
     np.add.at(found, model.next_state[state, action], model.prob[state, action])
     return found
@@ -364,7 +332,7 @@ def chances(env_id, state, action, **kwargs):
 
 def test_the_tiger_is_heard_where_it_is_with_the_accuracy():
     env = gym.make("Tiger-v0", accuracy=0.8)
-    model, heard = transition_model(env), observations_of_states(env)
+    model, heard = known.transition_model(env), known.observations_of_states(env)
     hidden = [env.unwrapped.cell_of(state) for state in range(6)]
     assert list(zip(hidden, heard.tolist(), strict=True)) == [
         (tiger, sound) for tiger in (0, 1) for sound in (0, 1, 2)
@@ -376,15 +344,12 @@ def test_the_tiger_is_heard_where_it_is_with_the_accuracy():
         expected[3 * hidden[state] + 1], expected[3 * hidden[state] + 2] = near, far
         np.testing.assert_allclose(chances("Tiger-v0", state, 0, accuracy=0.8), expected)
         for door in (1, 2):
-            np.testing.assert_allclose(
-                chances("Tiger-v0", state, door, accuracy=0.8), [0.5, 0, 0, 0.5, 0, 0]
-            )
+            np.testing.assert_allclose(chances("Tiger-v0", state, door), [0.5, 0, 0, 0.5, 0, 0])
     rewards = [[-1.0, -100.0, 10.0]] * 3 + [[-1.0, 10.0, -100.0]] * 3
     np.testing.assert_allclose(model.expected_reward, rewards)
-    assert finite_horizon_optimum(model, time_limit(env)).start_value == pytest.approx(100)
+    best = mdp.finite_horizon_optimum(model, known.time_limit(env)).start_value
+    assert best == pytest.approx(100)
 
-
-# --- Hallway --------------------------------------------------------------------------------------
 
 NORTH, EAST, SOUTH, WEST = range(4)
 STAY, FORWARD, RIGHT, AROUND, LEFT = range(5)
@@ -404,38 +369,30 @@ def places(cell, action, facing):
     return {key: pytest.approx(value) for key, value in found.items()}
 
 
-# Rows of the file hallway.POMDP, with its states written as cell and facing.
-@pytest.mark.parametrize(
-    ("cell", "facing", "expected"),
-    [
-        (0, EAST, {(1, EAST): 0.8, (0, EAST): 0.2}),
-        (2, EAST, {(3, EAST): 0.8, (11, SOUTH): 0.05, (1, EAST): 0.025, (1, WEST): 0.025,
-                   (2, EAST): 0.1}),
-        (2, NORTH, {(3, EAST): 0.05, (11, NORTH): 0.025, (11, SOUTH): 0.025, (1, WEST): 0.05,
-                    (2, NORTH): 0.85}),
-        (12, SOUTH, {(4, NORTH): 0.025, (4, SOUTH): 0.025, (12, SOUTH): 0.95}),
-    ],
-)  # fmt: skip
-def test_moving_forward_is_that_of_the_original(cell, facing, expected):
-    assert places(cell, FORWARD, facing) == expected
+TURNS = {RIGHT: (0.1, 0.7, 0.1, 0.1), AROUND: (0.1, 0.15, 0.6, 0.15), LEFT: (0.1, 0.1, 0.1, 0.7)}
+MOVES = [  # rows of the file hallway.POMDP, with its states written as cell and facing
+    (0, FORWARD, EAST, {(1, EAST): 0.8, (0, EAST): 0.2}),
+    (2, FORWARD, EAST, {(3, EAST): 0.8, (11, SOUTH): 0.05, (1, EAST): 0.025, (1, WEST): 0.025,
+                        (2, EAST): 0.1}),
+    (2, FORWARD, NORTH, {(3, EAST): 0.05, (11, NORTH): 0.025, (11, SOUTH): 0.025, (1, WEST): 0.05,
+                         (2, NORTH): 0.85}),
+    (12, FORWARD, SOUTH, {(4, NORTH): 0.025, (4, SOUTH): 0.025, (12, SOUTH): 0.95}),
+    *((5, STAY, facing, {(5, facing): 1}) for facing in range(4)),
+    *((5, action, facing, {(5, (facing + turn) % 4): by_turn[turn] for turn in range(4)})
+      for action, by_turn in TURNS.items() for facing in range(4)),
+]  # fmt: skip
 
 
-def test_turning_is_that_of_the_original():
-    for facing in range(4):
-        turned = [(5, (facing + turn) % 4) for turn in range(4)]
-        for action, by_turn in (
-            (RIGHT, (0.1, 0.7, 0.1, 0.1)), (AROUND, (0.1, 0.15, 0.6, 0.15)),
-            (LEFT, (0.1, 0.1, 0.1, 0.7)),
-        ):  # fmt: skip
-            assert places(5, action, facing) == dict(zip(turned, by_turn, strict=True))
-        assert places(5, STAY, facing) == {(5, facing): 1}
+@pytest.mark.parametrize(("cell", "action", "facing", "expected"), MOVES)
+def test_moves_in_the_hallway_are_those_of_the_original(cell, action, facing, expected):
+    assert places(cell, action, facing) == expected
 
 
 def test_readings_are_those_of_the_original():
     from rl_yardstick.envs.pomdp import _hallway
 
     env, world = gym.make("Hallway-v0"), _hallway()
-    model = transition_model(env)
+    model = known.transition_model(env)
 
     def readings(cell, facing):
         """The chances of readings at the start, given where that is, as they are after staying."""
@@ -463,12 +420,9 @@ def test_readings_are_those_of_the_original():
     assert model.reward[~ends & (model.prob > 0) & model.reachable[:, None, None]].max() == 0
 
 
-# --- DarkWarehouse --------------------------------------------------------------------------------
-
-
 def test_the_dark_shows_the_four_cells_beside():
     env = gym.make("DarkWarehouse-v0", desc=["S.G", "#.."], random_start=False)
-    seen = observations_of_states(env)
+    seen = known.observations_of_states(env)
     # Above, below, left, right, in base 3: 1 a shelf or the wall, 2 the goal.
     assert [np.base_repr(code, 3).zfill(4) for code in seen.tolist()] == [
         "1110", "1002", "1001", "0110", "0110", "2101",

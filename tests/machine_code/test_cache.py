@@ -5,9 +5,13 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from numba.core import event
 
+from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.machine_code import cache as code_cache
+from rl_yardstick.machine_code.compiling import called, compile_timer, compiled, inlined, kernel
 
 # A function, and another of another file that it is compiled into.
 RULE = """
@@ -54,14 +58,8 @@ def run(root, code):
     """The words that code prints which imports the copy."""
     variables = {**os.environ, "PYTHONPATH": str(root)}
     variables.pop("NUMBA_CACHE_DIR", None)
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=root,
-        env=variables,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command, told = [sys.executable, "-c", code], {"capture_output": True, "text": True}
+    done = subprocess.run(command, cwd=root, env=variables, check=False, **told)
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
 
@@ -96,14 +94,12 @@ USE = """
 import numpy as np
 from own_rules import Own
 from rl_yardstick.agents.common.algorithm import Transitions
-def q(cls):
-    # Not a whole training, whose other functions would be compiled too.
-    model = cls(env="FrozenLake-v1", learning_rate=1.0, gamma=1.0)
-    model._begin_episodes()
-    zero, no = np.array([0]), np.array([False])
-    model._learn_from(Transitions(zero, zero, np.zeros(1), no, no, zero))
-    return float(model.policy.q_table[0, 0])
-print(q(Own))
+# Not a whole training, whose other functions would be compiled too.
+model = Own(env="FrozenLake-v1", learning_rate=1.0, gamma=1.0)
+model._begin_episodes()
+zero, no = np.array([0]), np.array([False])
+model._learn_from(Transitions(zero, zero, np.zeros(1), no, no, zero))
+print(float(model.policy.q_table[0, 0]))
 """
 
 
@@ -145,3 +141,72 @@ def test_where_the_package_cannot_be_written_the_home_serves_or_nothing(
     else:
         assert found is None
         assert "each process compiles anew" in caplog.text
+
+
+@called
+def scale(numbers, factor):
+    for i in range(len(numbers)):
+        numbers[i] *= factor
+
+
+@inlined
+def total(numbers, times):
+    result = 0.0
+    for i in range(len(numbers)):
+        result += numbers[i]
+    return times * result
+
+
+@kernel
+def scaled_total(numbers, times):
+    scale(numbers, 2)
+    scale(numbers, times)
+    return total(numbers, 1) + total(numbers, times)
+
+
+class Compiled(event.Listener):
+    """Names of what is compiled."""
+
+    names = ()
+
+    def on_start(self, event):
+        self.names += (event.data["dispatcher"].py_func.__name__,)
+
+    def on_end(self, event):
+        pass
+
+
+def test_parts_are_compiled_once_and_only_python_is_refused():
+    numbers = np.array([1.0, 2.5])
+    with pytest.raises(TypeError, match="only compiled functions can call scale"):
+        scale(numbers, 2)
+    noted = Compiled()
+    with event.install_listener("numba:compile", noted):
+        assert scaled_total(numbers, 3) == 4 * 6 * 3.5
+    # Numbers that are written out are none of their own type.
+    assert sorted(noted.names) == ["scale", "scaled_total", "total"]
+    assert numbers.tolist() == [6.0, 15.0]
+    with pytest.raises(TypeError, match="only compiled functions can call scale"):
+        scale(numbers, 2)
+    assert total(numbers, 2) == 42
+
+
+def test_compiling_is_timed_as_a_whole():
+    @compiled
+    def inner(x):
+        return x * np.pi + 1
+
+    @compiled
+    def outer(x):
+        return inner(x) - np.pi
+
+    begun = WorkTime.now()
+    with compile_timer() as time_compiling:
+        assert time_compiling() == WorkTime()
+        outer(2.0)
+        first = time_compiling()
+        outer(3.0)
+        assert time_compiling() == first
+    taken = WorkTime.now() - begun
+    assert 0 < first.seconds <= taken.seconds
+    assert 0 < first.cpu_seconds <= taken.cpu_seconds

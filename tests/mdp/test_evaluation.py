@@ -6,17 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from rl_yardstick import mdp
 from rl_yardstick.envs.known_models import transition_model
-from rl_yardstick.mdp import (
-    TransitionModel,
-    baseline_policies,
-    finite_horizon_optimum,
-    optimal_choices,
-    optimum_far_from_limit,
-    policy_return,
-    state_visitation,
-    value_iteration,
-)
 from tests.mdp.test_random_models import deterministic
 
 
@@ -29,7 +20,7 @@ def coin(end, reward=1.0):
 
     A second action does the same and never ends it.
     """
-    return TransitionModel(
+    return mdp.TransitionModel(
         prob=np.array([[[end, 1 - end], [1.0, 0.0]]]),
         next_state=np.zeros((1, 2, 2), int),
         reward=np.full((1, 2, 2), reward),
@@ -39,23 +30,23 @@ def coin(end, reward=1.0):
 
 
 def test_the_geometric_distribution_to_its_end_cut_off_and_without_end():
-    found = policy_return(coin(0.2, reward=3), np.array([0]), None)
-    figures = (found.expected_length, found.length_variance, found.expected_return)
-    assert figures == pytest.approx((5, 0.8 / 0.04, 15))
-    assert found.return_variance == pytest.approx(9 * 0.8 / 0.04)
+    found = mdp.policy_return(coin(0.2, reward=3), np.array([0]), None)
+    lengths, returns = (5, 0.8 / 0.04), (15, 9 * 0.8 / 0.04)
+    assert (found.expected_length, found.length_variance) == pytest.approx(lengths)
+    assert (found.expected_return, found.return_variance) == pytest.approx(returns)
     assert found.success_rate is None
     model = coin(0.5)
-    found = policy_return(model, np.array([0]), 3, success=model.terminated)
+    found = mdp.policy_return(model, np.array([0]), 3, success=model.terminated)
     assert (found.expected_length, found.success_rate) == (0.5 * 1 + 0.25 * 2 + 0.25 * 3, 0.875)
-    assert state_visitation(model, np.array([0]), 3).tolist() == [1.75]
+    assert mdp.state_visitation(model, np.array([0]), 3).tolist() == [1.75]
     success = np.ones((1, 2, 2), bool)
-    found = policy_return(model, np.array([1]), None, 0.9, success)
+    found = mdp.policy_return(model, np.array([1]), None, 0.9, success)
     assert found.expected_return == pytest.approx(10)
     assert found.return_variance == pytest.approx(0)
     assert (found.expected_length, found.success_rate) == (np.inf, 0)
     assert np.isnan(found.length_variance)
     # Marks of success that do not end the episode are ignored.
-    assert policy_return(model, np.array([1]), 9, success=success).success_rate == 0
+    assert mdp.policy_return(model, np.array([1]), 9, success=success).success_rate == 0
 
 
 @pytest.mark.parametrize("horizon", [None, 400])
@@ -63,8 +54,8 @@ def test_drawn_rewards_add_their_own_variance(horizon):
     still = coin(0.2, reward=3)
     drawn = replace(still, reward_variance=np.full((1, 2, 2), 4.0))
     for discount in (1.0, 0.9):
-        known = policy_return(still, np.array([0]), horizon, discount)
-        found = policy_return(drawn, np.array([0]), horizon, discount)
+        known = mdp.policy_return(still, np.array([0]), horizon, discount)
+        found = mdp.policy_return(drawn, np.array([0]), horizon, discount)
         # Each step is reached with probability 0.8 ** t, and weighs discount ** (2 t).
         added = 4 / (1 - 0.8 * discount**2)
         assert found.return_variance == pytest.approx(known.return_variance + added)
@@ -73,37 +64,37 @@ def test_drawn_rewards_add_their_own_variance(horizon):
 
 def test_large_chains_are_solved_as_small_ones_are(monkeypatch):
     model = model_of("FrozenLake-v1", map_name="8x8")
-    uniform = baseline_policies(model)[0]
-    dense = policy_return(model, uniform, None, success=model.terminated)
-    dense_visits = state_visitation(model, uniform, None)
+    uniform = mdp.baseline_policies(model)[0]
+    dense = mdp.policy_return(model, uniform, None, success=model.terminated)
+    dense_visits = mdp.state_visitation(model, uniform, None)
     monkeypatch.setattr("rl_yardstick.mdp.graph.LARGEST_DENSE", 0)
-    sparse = policy_return(model, uniform, None, success=model.terminated)
+    sparse = mdp.policy_return(model, uniform, None, success=model.terminated)
     for name, value in vars(dense).items():
         assert getattr(sparse, name) == pytest.approx(value, rel=1e-10), name
-    np.testing.assert_allclose(state_visitation(model, uniform, None), dense_visits, rtol=1e-10)
+    np.testing.assert_allclose(mdp.state_visitation(model, uniform, None), dense_visits, rtol=1e-10)
 
 
 def test_forms_of_one_policy_agree():
     model = model_of("FrozenLake-v1")
-    actions = value_iteration(model, 0.99).policy
+    actions = mdp.value_iteration(model, 0.99).policy
     matrix = np.eye(4)[actions]
-    expected = policy_return(model, actions, 100)
+    expected = mdp.policy_return(model, actions, 100)
     for form in (matrix, matrix.astype(np.float32), np.tile(actions.astype(np.uint8), (100, 1))):
-        assert policy_return(model, form, 100) == expected
+        assert mdp.policy_return(model, form, 100) == expected
     # Networks round their probabilities.
     third = np.array([[1 / 3, 2 / 3]])
     rounded = third.astype(np.float32) * np.float32(1 + 1e-6)
-    found, exact = (policy_return(coin(0.5), form, 50) for form in (rounded, third))
+    found, exact = (mdp.policy_return(coin(0.5), form, 50) for form in (rounded, third))
     assert found.expected_return == pytest.approx(exact.expected_return)
 
 
 def test_what_a_policy_says_of_unreachable_states_is_ignored():
     model = model_of("CliffWalking-v1")
-    policy = np.where(model.reachable, value_iteration(model, 1.0).policy, 77)
-    assert policy_return(model, policy, 200).expected_return == -13
+    policy = np.where(model.reachable, mdp.value_iteration(model, 1.0).policy, 77)
+    assert mdp.policy_return(model, policy, 200).expected_return == -13
     matrix = np.full((model.n_states, 4), 0.25)
     matrix[~model.reachable] = np.nan
-    assert np.isfinite(policy_return(model, matrix, 200).expected_return)
+    assert np.isfinite(mdp.policy_return(model, matrix, 200).expected_return)
 
 
 @pytest.mark.parametrize(
@@ -117,34 +108,9 @@ def test_what_a_policy_says_of_unreachable_states_is_ignored():
     ids=str,
 )
 def test_wrong_policies_are_refused(policy, horizon, message):
-    for function in (policy_return, state_visitation):
+    for function in (mdp.policy_return, mdp.state_visitation):
         with pytest.raises(ValueError, match=message):
             function(coin(0.5), np.array(policy), horizon)
-
-
-# --- values of states, with the whole time limit ahead -------------------------------------------
-
-LEFT, RIGHT = 0, 1
-
-
-def corridor():
-    """States 0 to 3 in a row, and state 4, which nothing leads to.
-
-    Each step costs 1; left of state 0 is a wall, right of state 3 the exit, worth 10.
-    """
-    next_state = [[0, 1], [0, 2], [1, 3], [2, 3], [4, 4]]
-    reward = [[-1, -1], [-1, -1], [-1, -1], [-1, 10], [50, 50]]
-    return deterministic(next_state, reward, np.arange(10).reshape(5, 2) == 7)
-
-
-def test_what_is_best_in_a_corridor():
-    values, optimal = optimal_choices(corridor(), 100)
-    assert values.tolist() == [7, 8, 9, 10, 0]
-    assert optimal[:4].tolist() == [[False, True]] * 4
-    # Too late to get out of states 0 and 1: all ways of losing time are equal.
-    values, optimal = optimal_choices(corridor(), 2)
-    assert values.tolist() == [-2, -2, 9, 10, 0]
-    assert optimal[:4].tolist() == [[True, True], [True, True], [False, True], [False, True]]
 
 
 @pytest.mark.parametrize(
@@ -154,22 +120,16 @@ def test_actions_are_equal_within_rounding(worth, advantage, n_best):
     model = coin(1.0)
     reward = np.array([[[worth, worth], [worth + advantage] * 2]])
     model = replace(model, reward=reward, terminated=np.ones((1, 2, 2), bool))
-    assert optimal_choices(model, 3)[1].sum() == n_best
-
-
-# --- a time limit ---------------------------------------------------------------------------------
+    assert mdp.optimal_choices(model, 3)[1].sum() == n_best
 
 
 def test_a_way_that_goes_round_for_a_million_steps():
     """0 leads to 1, and 1 and 2 to each other, for 1, 2 and 3; seven steps are 1 + 3 (2 + 3)."""
     model = deterministic([[1], [2], [1]], [[1], [2], [3]], [[False]] * 3)
     policy = np.zeros(3, int)
-    assert policy_return(model, policy, 7).expected_return == 16
-    assert policy_return(model, policy, 10**6 + 1).expected_return == 1 + 5 * 10**6 / 2
-    assert policy_return(model, policy, 10**6 + 1).expected_length == 10**6 + 1
-
-
-# --- a limit far away ----------------------------------------------------------------------------
+    assert mdp.policy_return(model, policy, 7).expected_return == 16
+    assert mdp.policy_return(model, policy, 10**6 + 1).expected_return == 1 + 5 * 10**6 / 2
+    assert mdp.policy_return(model, policy, 10**6 + 1).expected_length == 10**6 + 1
 
 
 def far_goal(end=-50.0, step=-1.0, ends=True):
@@ -183,9 +143,9 @@ def test_a_limit_that_matters_is_noticed():
     # With an end that costs 50, 30 steps of standing still are better; and 60 are no better than
     # 10 steps to the end, which is too close to call without looking.
     for limit in (30, 58, 62):
-        assert optimum_far_from_limit(far_goal(), limit) is None
-    assert optimum_far_from_limit(far_goal(), 200) == -59.0
-    assert finite_horizon_optimum(far_goal(), 30).start_value == -30.0
+        assert mdp.optimum_far_from_limit(far_goal(), limit) is None
+    assert mdp.optimum_far_from_limit(far_goal(), 200) == -59.0
+    assert mdp.finite_horizon_optimum(far_goal(), 30).start_value == -30.0
     # Where steps cost nothing, or nobody arrives, nothing can be said.
-    assert optimum_far_from_limit(far_goal(end=5.0, step=0.0), 10**6) is None
-    assert optimum_far_from_limit(far_goal(ends=False), 10**6) is None
+    assert mdp.optimum_far_from_limit(far_goal(end=5.0, step=0.0), 10**6) is None
+    assert mdp.optimum_far_from_limit(far_goal(ends=False), 10**6) is None

@@ -4,16 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
-from rl_yardstick.mdp import finite_horizon_optimum, policy_return
-from rl_yardstick.mdp.gaps import (
-    discounted_values,
-    expected_estimates,
-    first_differences,
-    gap_by_state,
-    greedy_repairs,
-    policy_gradient,
-)
+from rl_yardstick.mdp import finite_horizon_optimum, gaps, policy_return
+from rl_yardstick.mdp.gaps import discounted_values, expected_estimates
 from tests.mdp.test_random_models import deterministic, distributions, models, moved_on
 
 
@@ -27,12 +21,8 @@ def models_and_policies(draw, n_policies=1):
         kind = draw(st.sampled_from(["actions", "with time", "probabilities"]))
         if kind == "probabilities":
             return draw(distributions(shape))
-        n_steps = horizon if kind == "with time" else 1
-        rows = [
-            draw(st.lists(st.integers(0, shape[1] - 1), min_size=shape[0], max_size=shape[0]))
-            for _ in range(n_steps)
-        ]
-        return np.array(rows) if kind == "with time" else np.array(rows[0])
+        size = (horizon, shape[0]) if kind == "with time" else shape[0]
+        return draw(hnp.arrays(np.int64, size, elements=st.integers(0, shape[1] - 1)))
 
     return model, horizon, *[policy() for _ in range(n_policies)]
 
@@ -59,7 +49,7 @@ def test_what_each_state_loses_is_that_of_a_recursion(drawn):
         losses += here * (values.max(axis=1) - (now * values).sum(axis=1))
         visits, worth = visits + here, worth + here[:, None] * values
         here = moved_on(model, here, now)
-    split = gap_by_state(model, policy, horizon)
+    split = gaps.gap_by_state(model, policy, horizon)
     value = policy_return(model, policy, horizon).expected_return
     assert (split.optimum, split.value) == pytest.approx((model.initial @ best, value), abs=1e-9)
     assert split.losses == pytest.approx(losses, abs=1e-9)
@@ -72,10 +62,10 @@ def test_what_each_state_loses_is_that_of_a_recursion(drawn):
 @given(models_and_policies(n_policies=2))
 def test_gains_where_two_policies_part_sum_to_their_difference(drawn):
     model, horizon, first, second = drawn
-    found = first_differences(model, first, second, horizon)
+    found = gaps.first_differences(model, first, second, horizon)
     returns = [policy_return(model, one, horizon).expected_return for one in (first, second)]
     assert found.gains.sum() == pytest.approx(returns[0] - returns[1], abs=1e-9)
-    assert not first_differences(model, first, first, horizon).met.any()
+    assert not gaps.first_differences(model, first, first, horizon).met.any()
     here, met = model.initial, np.zeros(model.n_states)
     for one, two in zip(*(at_each_step(model, p, horizon) for p in (first, second)), strict=True):
         parts = (np.abs(one - two) > 1e-6).any(axis=1)
@@ -89,15 +79,15 @@ def test_gains_where_two_policies_part_sum_to_their_difference(drawn):
 def test_repairs_are_the_best_states_to_mend_one_after_the_other(drawn):
     """Against the optimum of a model in which all states but the repaired have one action."""
     model, horizon, policy = drawn
-    split = gap_by_state(model, policy, horizon)
-    repairs = greedy_repairs(model, policy, horizon, split)
+    split = gaps.gap_by_state(model, policy, horizon)
+    repairs = gaps.greedy_repairs(model, policy, horizon, split)
     assert len(repairs) <= 3
     if policy.ndim != 1:  # what it does elsewhere has to be fixed
         return
     mask, done = np.eye(model.n_actions, dtype=np.bool_)[policy], policy
     states = np.arange(model.n_states)[:, None]
     for repair in [*repairs, None]:
-        losing = gap_by_state(model, done, horizon).losses > 1e-7
+        losing = gaps.gap_by_state(model, done, horizon).losses > 1e-7
         plans = [
             finite_horizon_optimum(model, horizon, mask=mask | (states == state))
             for state in range(model.n_states)
@@ -119,16 +109,13 @@ def test_the_gradient_of_a_policy_is_that_of_its_return(drawn):
     model, horizon, policy = drawn
     if policy.dtype != np.float64:
         return
-    value, slope = policy_gradient(model, policy, horizon)
+    value, slope = gaps.policy_gradient(model, policy, horizon)
     assert value == pytest.approx(policy_return(model, policy, horizon).expected_return, abs=1e-9)
     toward = np.full_like(policy, 1 / model.n_actions) - policy
     step = 1e-6
     nearby = policy_return(model, policy + step * toward, horizon).expected_return
     scale = max(1.0, np.abs(slope).max())
     assert (nearby - value) / step == pytest.approx((slope * toward).sum(), abs=1e-3 * scale)
-
-
-# --- what advantage estimation expects ------------------------------------------------------------
 
 
 def chain():

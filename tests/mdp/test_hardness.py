@@ -9,14 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rl_yardstick.envs.known_models import success_outcomes, time_limit, transition_model
-from rl_yardstick.mdp import TransitionModel, finite_horizon_optimum, hardness_of
-from rl_yardstick.mdp.hardness import (
-    action_gaps,
-    diameter,
-    hitting_times,
-    looking_ahead,
-    random_wait,
-)
+from rl_yardstick.mdp import TransitionModel, finite_horizon_optimum, hardness, hardness_of
 from tests.mdp.test_random_models import deterministic, models
 
 
@@ -27,7 +20,7 @@ def corridor(n, *, ends):
     return deterministic(np.clip(places + np.array([-1, 1]), 0, n - 1), last, last & ends)
 
 
-def choice(rewards):
+def choice(*rewards):
     """One state, in which each action earns something."""
     return deterministic([[0] * len(rewards)], [rewards], [[False] * len(rewards)])
 
@@ -35,11 +28,13 @@ def choice(rewards):
 def test_random_actions_take_n_squared_steps_to_the_end_of_a_corridor():
     """A walk that is held at 0 needs n (n + 1) steps to n; the limit of 10,000 cuts off none."""
     model = corridor(5, ends=True)
-    assert random_wait(model, model.reward > 0, 10_000) == pytest.approx((5 * 6, 1), rel=1e-9)
+    assert hardness.random_wait(model, model.reward > 0, 10_000) == pytest.approx(
+        (5 * 6, 1), rel=1e-9
+    )
     # With three steps for three places, one episode of 8 gets there, and each takes 3 steps.
     model = corridor(3, ends=True)
-    assert random_wait(model, model.reward > 0, 3) == pytest.approx((24.0, 8.0))
-    assert random_wait(model, model.reward > 0, 2) == (math.inf, math.inf)
+    assert hardness.random_wait(model, model.reward > 0, 3) == pytest.approx((24.0, 8.0))
+    assert hardness.random_wait(model, model.reward > 0, 2) == (math.inf, math.inf)
 
 
 @pytest.mark.parametrize("size", [4, 9])
@@ -75,21 +70,21 @@ def test_a_lake_that_is_not_slippery():
 
 def test_two_arms():
     """With 20 pulls left: v = 9.5 * 19, b = 19 and d = 1 for both arms, so m = 6439."""
-    model = choice([1.0, 0.0])
-    assert action_gaps(model, finite_horizon_optimum(model, 20)) == (1.0, 1.0)
-    lookahead, bound = looking_ahead(model, 20)
+    model = choice(1.0, 0.0)
+    assert hardness.action_gaps(model, finite_horizon_optimum(model, 20)) == (1.0, 1.0)
+    lookahead, bound = hardness.looking_ahead(model, 20)
     episodes = math.ceil(8 * (9.5 * 19 + 19 / 6) * math.log(2 * 20 * 2))
     assert (lookahead, episodes) == (1, 6439)
     assert bound == pytest.approx(1 + math.log2(episodes))
     # Seven pulls can be tried in all combinations, with less.
-    assert looking_ahead(model, 7) == (1, 7.0)
+    assert hardness.looking_ahead(model, 7) == (1, 7.0)
 
 
 def test_arms_that_are_alike_are_no_mistake():
-    found = hardness_of(choice([0.5, 0.5]), 10)
+    found = hardness_of(choice(0.5, 0.5), 10)
     assert (found.smallest_gap, found.mean_gap) == (None, None)
     assert (found.lookahead, found.effective_horizon) == (1, 1.0)
-    alone = hardness_of(choice([0.5]), 10)
+    alone = hardness_of(choice(0.5), 10)
     assert (alone.lookahead, alone.effective_horizon) == (1, None)
 
 
@@ -102,9 +97,9 @@ def test_hitting_times_are_those_of_the_fastest_policy():
         terminated=np.zeros((2, 2, 2), np.bool_),
         initial=np.array([1.0, 0.0]),
     )
-    assert hitting_times(model, 1).tolist() == pytest.approx([4, 0])
-    assert hitting_times(model, 0).tolist() == pytest.approx([0, 1])
-    assert diameter(model) == pytest.approx((4, 1))
+    assert hardness.hitting_times(model, 1).tolist() == pytest.approx([4, 0])
+    assert hardness.hitting_times(model, 0).tolist() == pytest.approx([0, 1])
+    assert hardness.diameter(model) == pytest.approx((4, 1))
 
 
 def worst_greedy_return(model, horizon, k):
@@ -137,7 +132,7 @@ def worst_greedy_return(model, horizon, k):
 
 @given(models(states=3, actions=2, outcomes=2), st.integers(1, 4))
 def test_the_lookahead_is_the_first_depth_at_which_no_greedy_policy_fails(model, horizon):
-    lookahead, bound = looking_ahead(model, horizon)
+    lookahead, bound = hardness.looking_ahead(model, horizon)
     optimum = finite_horizon_optimum(model, horizon).start_value
     solved = [
         worst_greedy_return(model, horizon, k) == pytest.approx(optimum, abs=1e-9)

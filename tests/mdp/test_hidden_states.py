@@ -6,14 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from rl_yardstick import mdp
 from rl_yardstick.envs.known_models import observations_of_states, transition_model
-from rl_yardstick.mdp import (
-    TransitionModel,
-    beliefs,
-    finite_horizon_optimum,
-    memoryless,
-    policy_return,
-)
 from rl_yardstick.mdp.beliefs import memory_optimum
 from rl_yardstick.mdp.memoryless import best_memoryless, observation_groups
 
@@ -22,7 +16,7 @@ def random_world(seed, n_states=4, n_actions=2, n_groups=2):
     """A random world with terminations, whose observations hide the state."""
     rng = np.random.default_rng(seed)
     shape = (n_states, n_actions, 2)
-    model = TransitionModel(
+    model = mdp.TransitionModel(
         prob=rng.dirichlet(np.ones(2), shape[:2]),
         next_state=rng.integers(n_states, size=shape),
         reward=rng.integers(-3, 4, size=shape).astype(float),
@@ -63,9 +57,9 @@ def test_the_optimum_with_memory_is_that_of_a_recursion(n_groups):
 def test_brackets_of_trees_that_are_cut_hold_the_optimum(seed, monkeypatch):
     model, groups = random_world(seed, n_states=6, n_actions=3, n_groups=3)
     exact = memory_optimum(model, groups, 7)
-    assert exact.lower == exact.upper <= finite_horizon_optimum(model, 7).start_value + 1e-9
-    monkeypatch.setattr(beliefs, "MOST_BELIEFS", 3)
-    monkeypatch.setattr(beliefs, "MOST_OF_MORE", 3)
+    assert exact.lower == exact.upper <= mdp.finite_horizon_optimum(model, 7).start_value + 1e-9
+    monkeypatch.setattr(mdp.beliefs, "MOST_BELIEFS", 3)
+    monkeypatch.setattr(mdp.beliefs, "MOST_OF_MORE", 3)
     cut = memory_optimum(model, groups, 7)
     assert cut.lower <= exact.upper + 1e-9
     assert exact.upper <= cut.upper + 1e-9
@@ -97,9 +91,6 @@ def test_values_of_the_tiger_are_those_worked_out_by_hand(accuracy, horizon, val
     assert found.lower == found.upper == pytest.approx(value, abs=1e-12)
 
 
-# --- by the present observation alone -------------------------------------------------------------
-
-
 def test_the_best_in_the_short_corridor_is_random_and_proved():
     """Sutton and Barto, example 13.1: right with probability 2 - sqrt(2)."""
     model, groups = hidden_of("ShortCorridor-v0")
@@ -119,7 +110,7 @@ def test_no_policy_of_a_fine_grid_is_above_the_bound(seed):
 
     def value(one, two):
         policy = np.array([[one, 1 - one], [two, 1 - two]])[groups]
-        return policy_return(model, policy, 6).expected_return
+        return mdp.policy_return(model, policy, 6).expected_return
 
     best = max(value(one, two) for one in grid for two in grid)
     assert best <= found.upper + 1e-9
@@ -132,13 +123,13 @@ def test_no_policy_of_a_fine_grid_is_above_the_bound(seed):
 
 @pytest.mark.parametrize("most_tried", [100_000, 0], ids=["all tried", "hill climbing"])
 def test_the_best_deterministic_policy_is_that_of_brute_force(most_tried, monkeypatch):
-    monkeypatch.setattr(memoryless, "MOST_FIRM", most_tried)
-    monkeypatch.setattr(memoryless, "MOST_RETURNS", 1)
+    monkeypatch.setattr(mdp.memoryless, "MOST_FIRM", most_tried)
+    monkeypatch.setattr(mdp.memoryless, "MOST_RETURNS", 1)
     for seed in range(3):
         model, groups = random_world(seed, n_states=6, n_actions=3, n_groups=4)
         found = best_memoryless(model, groups, 6)
         choices = (np.array(each)[groups] for each in product(range(3), repeat=4))
-        best = max(policy_return(model, choice, 6).expected_return for choice in choices)
+        best = max(mdp.policy_return(model, choice, 6).expected_return for choice in choices)
         assert found.firm == pytest.approx(best)
         assert found.is_firm_known == (most_tried > 0)
     # Of 16,384 policies, as counted by another program; with the goal in the third aisle too.
@@ -152,10 +143,10 @@ def test_the_best_deterministic_policy_is_that_of_brute_force(most_tried, monkey
 def test_bounds_without_time_hold_too(seed, monkeypatch):
     model, groups = random_world(seed, n_states=6, n_actions=3, n_groups=3)
     known = best_memoryless(model, groups, 6)
-    monkeypatch.setattr(memoryless, "MOST_RETURNS", 1)
+    monkeypatch.setattr(mdp.memoryless, "MOST_RETURNS", 1)
     cut = best_memoryless(model, groups, 6)
     assert cut.lower == known.lower
-    assert known.upper <= cut.upper <= finite_horizon_optimum(model, 6).start_value + 1e-9
+    assert known.upper <= cut.upper <= mdp.finite_horizon_optimum(model, 6).start_value + 1e-9
 
 
 def test_groups_are_of_equal_rows_and_none_where_states_are_told_apart():

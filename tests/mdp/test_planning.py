@@ -10,25 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from rl_yardstick import mdp
 from rl_yardstick.envs.known_models import transition_model
-from rl_yardstick.mdp import (
-    TransitionModel,
-    finite_horizon_optimum,
-    policy_iteration,
-    policy_return,
-    value_iteration,
-)
 from rl_yardstick.mdp.planning import Plan
 from tests.mdp.test_random_models import deterministic, models
 
-PLANNERS = pytest.mark.parametrize("plan", [value_iteration, policy_iteration])
+PLANNERS = pytest.mark.parametrize("plan", [mdp.value_iteration, mdp.policy_iteration])
 
 
 def model_of(env_id, **kwargs):
     return transition_model(gym.make(f"envs:{env_id}", **kwargs))
 
-
-# --- known optima ---------------------------------------------------------------------------------
 
 OPTIMA = [
     ("Warehouse-v0", {}, 1.0, 79.0, 1e-9),
@@ -48,7 +40,7 @@ def test_known_optima_are_found_and_earned(plan, env_id, kwargs, discount, optim
     found = plan(model, discount)
     assert found.start_value == pytest.approx(optimum, abs=tolerance)
     horizon = None if discount == 1 else 1000
-    earned = policy_return(model, found.policy, horizon, discount).expected_return
+    earned = mdp.policy_return(model, found.policy, horizon, discount).expected_return
     assert earned == pytest.approx(found.start_value, abs=1e-8)
 
 
@@ -63,9 +55,9 @@ def test_known_optima_are_found_and_earned(plan, env_id, kwargs, discount, optim
 def test_sweeps_that_end_early_say_by_how_much_they_may_be_wrong(env_id, kwargs, discount, most):
     """The error reaches a share of the bound, and never more than the bound."""
     model = model_of(env_id, **kwargs)
-    exact = policy_iteration(model, discount).values
+    exact = mdp.policy_iteration(model, discount).values
     for tolerance in (1e-3, 0.1):
-        found = value_iteration(model, discount, tolerance)
+        found = mdp.value_iteration(model, discount, tolerance)
         error = np.abs(found.values - exact)[model.reachable].max()
         assert most * found.error_bound < error <= found.error_bound <= tolerance
 
@@ -73,7 +65,7 @@ def test_sweeps_that_end_early_say_by_how_much_they_may_be_wrong(env_id, kwargs,
 def test_sweeps_that_contract_slowly_are_helped_out():
     """Far from the goal standing still is best, and forgets by the discount alone."""
     model = model_of("RandomWarehouse-v0", size=100, slip=0.1)
-    one, two = value_iteration(model, 0.99), policy_iteration(model, 0.99)
+    one, two = mdp.value_iteration(model, 0.99), mdp.policy_iteration(model, 0.99)
     assert one.iterations < 100  # sweeps alone take 362
     bound = one.error_bound + two.error_bound
     np.testing.assert_allclose(one.values, two.values, rtol=0, atol=bound)
@@ -81,8 +73,6 @@ def test_sweeps_that_contract_slowly_are_helped_out():
     gap = two.action_values.max(axis=1) - two.action_values[np.arange(len(one.policy)), one.policy]
     assert gap[model.reachable].max() <= 4 * bound
 
-
-# --- problems worked by hand ----------------------------------------------------------------------
 
 INF = np.inf
 BY_HAND = {  # next states, rewards, ends; the best values of actions, and the policy
@@ -139,12 +129,9 @@ def test_what_is_best_depends_on_the_steps_left():
     # Two steps to 10, or 1 at once: with a single step left only the 1 can be had.
     model = deterministic([[1, 0], [0, 0]], [[0, 1], [10, 0]], [[False, True], [True, True]])
     for horizon, first_actions in ((3, [0, 0, 1]), (2, [0, 1])):
-        found = finite_horizon_optimum(model, horizon)
+        found = mdp.finite_horizon_optimum(model, horizon)
         assert found.values.tolist() == [10.0, 10.0]
         assert found.policy[:, 0].tolist() == first_actions
-
-
-# --- among the actions that a mask allows ---------------------------------------------------------
 
 
 @settings(max_examples=40)
@@ -158,9 +145,9 @@ def test_a_mask_leaves_the_model_without_the_actions_that_it_forbids(model, data
     arrays = {name: getattr(model, name)[rows] for name in ("prob", "next_state", "reward")}
     other = replace(model, **arrays, terminated=model.terminated[rows])
     for plan in (
-        partial(value_iteration, discount=0.9),
-        partial(policy_iteration, discount=0.9),
-        partial(finite_horizon_optimum, horizon=7),
+        partial(mdp.value_iteration, discount=0.9),
+        partial(mdp.policy_iteration, discount=0.9),
+        partial(mdp.finite_horizon_optimum, horizon=7),
     ):
         found, expected = plan(model, mask=mask), plan(other)
         live = other.reachable
@@ -170,21 +157,15 @@ def test_a_mask_leaves_the_model_without_the_actions_that_it_forbids(model, data
             assert (np.isneginf(found.action_values) == ~mask)[live].all()
 
 
-# --- refusals -------------------------------------------------------------------------------------
-
-
 def test_masks_that_leave_no_way_are_refused():
     # Action 0 ends the episode, action 1 stays at a cost.
     model = deterministic([[0, 0]], [[5, -1]], [[True, False]])
-    assert value_iteration(model, 1.0, mask=np.array([[True, False]])).start_value == 5
+    assert mdp.value_iteration(model, 1.0, mask=np.array([[True, False]])).start_value == 5
     with pytest.raises(ValueError, match="no policy surely ends"):
-        value_iteration(model, 1.0, mask=np.array([[False, True]]))
-    for plan in (value_iteration, policy_iteration, finite_horizon_optimum):
+        mdp.value_iteration(model, 1.0, mask=np.array([[False, True]]))
+    for plan in (mdp.value_iteration, mdp.policy_iteration, mdp.finite_horizon_optimum):
         with pytest.raises(ValueError, match=r"^the mask allows nothing in state 0$"):
             plan(model, 1, mask=np.zeros((1, 2), bool))
-
-
-# --- the transition model -------------------------------------------------------------------------
 
 
 def arrays():
@@ -195,11 +176,12 @@ def arrays():
         "reward": np.array([[[2.0, 4.0], [-1.0, 99.0]], [[0.0, 0.0], [7.0, 7.0]]]),
         "terminated": np.array([[[False, True], [False, False]], [[False, False], [False, False]]]),
         "initial": np.array([1.0, 0.0]),
+        "reward_variance": np.ones((2, 2, 2)),
     }
 
 
 def test_sizes_and_derived_arrays():
-    model = TransitionModel(**arrays())
+    model = mdp.TransitionModel(**arrays())
     assert (model.n_states, model.n_actions, model.n_outcomes) == (2, 2, 2)
     assert model.expected_reward.tolist() == [[3.5, -1.0], [0.0, 7.0]]
     assert model.reachable.tolist() == [True, False]
@@ -212,26 +194,19 @@ def test_sizes_and_derived_arrays():
         ("prob", (0, 1), [1.5, -0.5], r"state 0, action 1 has a probability outside \[0, 1\]"),
         ("next_state", (1, 1, 0), 2, r"state 1, action 1 has a next state outside 0..1"),
         ("reward", (0, 0, 1), np.inf, "state 0, action 0 has a reward that is not finite"),
+        ("reward_variance", (1, 0, 1), -1, "state 1, action 0 has a variance of the reward"),
         ("initial", 0, 0.5, r"initial holds no probabilities that sum to one: \[0.5 0. \]"),
     ],
 )
 def test_wrong_arrays_are_refused(name, place, value, message):
     given = arrays()
     given["prob"][1, 1] = [0.5, 0.5 + 5e-10]  # rounding is accepted
-    TransitionModel(**given)
+    mdp.TransitionModel(**given)
     given[name][place] = value
     with pytest.raises(ValueError, match=message):
-        TransitionModel(**given)
+        mdp.TransitionModel(**given)
     with pytest.raises(ValueError, match=r"prob has shape \(2, 4\)"):
-        TransitionModel(**{**given, "prob": given["prob"].reshape(2, 4)})
-
-
-def test_variances_of_rewards_are_checked():
-    variance = np.ones((2, 2, 2))
-    assert TransitionModel(**arrays(), reward_variance=variance).reward_variance is not None
-    variance[1, 0, 1] = -1
-    with pytest.raises(ValueError, match="state 1, action 0 has a variance of the reward"):
-        TransitionModel(**arrays(), reward_variance=variance)
+        mdp.TransitionModel(**{**given, "prob": given["prob"].reshape(2, 4)})
 
 
 def test_from_gymnasium_pads_keeps_the_order_and_refuses_gaps():
@@ -240,7 +215,7 @@ def test_from_gymnasium_pads_keeps_the_order_and_refuses_gaps():
         0: {0: outcomes, 1: [(1.0, 1, 3.0, False)]},
         1: {0: [(1.0, 0, 4.0, False)], 1: [(1.0, 1, 5.0, True)]},
     }
-    model = TransitionModel.from_gymnasium(P, [1, 0])
+    model = mdp.TransitionModel.from_gymnasium(P, [1, 0])
     assert model.prob[0].tolist() == [[0.25, 0.5, 0.25], [1.0, 0.0, 0.0]]
     assert model.next_state[0, 0].tolist() == [1, 0, 1]
     assert model.reward[:, 1, 0].tolist() == [3.0, 5.0]
@@ -251,4 +226,4 @@ def test_from_gymnasium_pads_keeps_the_order_and_refuses_gaps():
         ({0: row, 1: {}}, "state 1 must have the actions 0 to 0"),
     ):
         with pytest.raises(ValueError, match=message):
-            TransitionModel.from_gymnasium(broken, np.ones(len(broken)) / len(broken))
+            mdp.TransitionModel.from_gymnasium(broken, np.ones(len(broken)) / len(broken))

@@ -1,6 +1,5 @@
 """What other rewards make of the optimal policies: by hand, by brute force, and potentials."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +10,13 @@ from hypothesis.extra import numpy as hnp
 
 from rl_yardstick.mdp import policy_return
 from rl_yardstick.mdp.shaping import discounted_effect, effect_under_limit
-from tests.mdp.test_random_models import deterministic, models, stationary_policies
+from tests.mdp.test_random_models import deterministic, every_policy, models
 
 DISCOUNTS = [0.3, 0.9]
+
+
+def worth(*args):
+    return policy_return(*args).expected_return
 
 
 def crossing(stop=1.0):
@@ -45,9 +48,8 @@ def test_a_bonus_for_stopping_by_hand(bonus, same, discounted, judged, factor):
 def shaped_by(model, potential, discount, factor=1.0):
     """The model with rewards times a factor, plus the difference of a potential."""
     after = np.where(model.terminated, 0.0, potential[model.next_state])
-    return replace(
-        model, reward=factor * model.reward + discount * after - potential[:, None, None]
-    )
+    shaped = factor * model.reward + discount * after - potential[:, None, None]
+    return replace(model, reward=shaped)
 
 
 def potentials(model):
@@ -75,27 +77,22 @@ def test_best_and_worst_are_those_of_all_optimal_policies(data, model, discount)
     rewards = hnp.arrays(np.int64, model.prob.shape, elements=st.integers(-3, 3))
     shaped = replace(model, reward=data.draw(rewards))
     found = discounted_effect(model, shaped, discount, 4)
-    policies = stationary_policies(model)
+    policies = every_policy(model)
     starts = [replace(model, initial=row) for row in np.eye(model.n_states)[model.reachable]]
 
     def are_optimal(reward):
         """By policy, whether no other is better from any state."""
-        values = [
-            [
-                policy_return(replace(m, reward=reward), p, None, discount).expected_return
-                for m in starts
-            ]
-            for p in policies
-        ]
+        each = [replace(start, reward=reward) for start in starts]
+        values = [[worth(one, policy, None, discount) for one in each] for policy in policies]
         return (np.array(values) >= np.max(values, axis=0) - 1e-9).all(axis=1)
 
-    returns = np.array([policy_return(model, p, None, discount).expected_return for p in policies])
+    returns = np.array([worth(model, p, None, discount) for p in policies])
     ours, theirs = are_optimal(model.reward), are_optimal(shaped.reward)
     assert found.optimum == pytest.approx(returns.max(), abs=1e-9)
     ends = returns[theirs].max(), returns[theirs].min()
     assert found.returns == pytest.approx(ends, abs=1e-9)
     assert found.is_same == (ours == theirs).all()
-    worst = policy_return(model, found.worst_policy, 4).expected_return
+    worst = worth(model, found.worst_policy, 4)
     assert worst == pytest.approx(found.judged[1], abs=1e-9)
 
 
@@ -105,14 +102,9 @@ def test_best_and_worst_under_a_limit_are_those_of_all_optimal_policies(data, mo
     rewards = hnp.arrays(np.int64, model.prob.shape, elements=st.integers(-3, 3))
     shaped = replace(model, reward=data.draw(rewards))
     found = effect_under_limit(model, shaped, horizon)
-    size = horizon, model.n_states
-    policies = [
-        np.reshape(actions, size)
-        for actions in itertools.product(range(model.n_actions), repeat=np.prod(size))
-    ]
+    policies = every_policy(model, horizon)
     returns, others = (
-        np.array([policy_return(each, p, horizon).expected_return for p in policies])
-        for each in (model, shaped)
+        np.array([worth(each, p, horizon) for p in policies]) for each in (model, shaped)
     )
     ours, theirs = returns >= returns.max() - 1e-9, others >= others.max() - 1e-9
     assert found.optimum == pytest.approx(returns.max(), abs=1e-9)
@@ -120,16 +112,13 @@ def test_best_and_worst_under_a_limit_are_those_of_all_optimal_policies(data, mo
     assert found.returns == pytest.approx(ends, abs=1e-9)
     assert found.is_same == (ours == theirs).all()
     for policy, value in ((found.policy, found.optimum), (found.worst_policy, ends[1])):
-        assert policy_return(model, policy, horizon).expected_return == pytest.approx(
-            value, abs=1e-9
-        )
+        assert worth(model, policy, horizon) == pytest.approx(value, abs=1e-9)
 
 
 def test_where_training_never_comes_every_action_may_be_taken():
     # Training begins in state 1, so nothing is learnt about state 0.
-    found = discounted_effect(
-        crossing(), replace(crossing(), initial=np.array([0.0, 1.0])), 0.5, 10
-    )
+    training = replace(crossing(), initial=np.array([0.0, 1.0]))
+    found = discounted_effect(crossing(), training, 0.5, 10)
     assert (found.differs.tolist(), found.returns) == ([True, False], (1.5, 1.0))
 
 

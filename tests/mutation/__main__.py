@@ -29,7 +29,6 @@ from pathlib import Path
 import hypothesis  # noqa: F401  # pytest's plugin imports it, in every child that has not
 import pytest
 from drawing import Mutant, drawn
-from quick import chosen, packages_of, weights
 
 NOT_COPIED = shutil.ignore_patterns(".*", "logs", "runs", "build", "__pycache__")
 LIBRARIES = "torch._dynamo scipy.stats pandas matplotlib.pyplot gymnasium stable_baselines3 numba"
@@ -83,7 +82,8 @@ class Copy:
         self.path, self.report = self.place / "copy", self.place / "report"
         shutil.rmtree(self.path, ignore_errors=True)
         shutil.copytree(root, self.path, symlinks=True, ignore=NOT_COPIED)
-        sources = packages_of(self.path)
+        folders = [file.parent for file in self.path.glob("*/__init__.py")]
+        sources = sorted(folder for folder in folders if not folder.is_symlink())
         self.broken: list[str] = []
         self.costs: dict[str, float] = {}
         self.entering: dict[str, set[str]] = defaultdict(set)
@@ -214,29 +214,15 @@ class Copy:
         return sorted(self.costs, key=rank), not covering
 
 
-def choose_quick(root: Path, copy: Copy, seconds: float) -> None:
-    """Write the names of those of daily work to ``tests/quick.txt``."""
-    costs, entered = defaultdict(float), defaultdict(set)
-    for test, cost in copy.costs.items():
-        costs[test.partition("[")[0]] += cost
-    for place, tests in copy.entering.items():
-        for test in tests:
-            entered[test.partition("[")[0]].add(place)
-    names = chosen(costs, entered, weights(root), seconds)
-    (root / "tests" / "quick.txt").write_text("\n".join(sorted(names)) + "\n")
-    print(f"{len(names)} test functions, {sum(costs[name] for name in names):.0f} s")
-
-
 def main() -> None:
     """Draw errors, or take those drawn before; judge each, and count."""
     root = Path(__file__).resolve().parents[2]
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("packages", nargs="*", help="folders of sources, such as rl_yardstick/mdp")
+    parser.add_argument("packages", nargs="+", help="folders of sources, such as rl_yardstick/mdp")
     parser.add_argument("-n", type=int, default=25, help="how many errors in each (25)")
     parser.add_argument("--seed", type=int, default=0, help="which errors (0)")
     parser.add_argument("--record", type=Path, help="write the errors and their fates to a file")
     parser.add_argument("--replay", type=Path, help="make the errors of such a file again")
-    parser.add_argument("--choose-quick", type=float, metavar="S", help="tests of so many seconds")
     parser.add_argument("--root", type=Path, default=root, help="another checkout than this one")
     args = parser.parse_args()
     root, entries = args.root.resolve(), []
@@ -246,8 +232,6 @@ def main() -> None:
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
     copy = Copy(root)
-    if args.choose_quick:
-        choose_quick(root, copy, args.choose_quick)
     for test in copy.broken:
         print(f"left out, as it fails without any error: {test}", file=sys.stderr)
     for package in args.packages:

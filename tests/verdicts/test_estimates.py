@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rl_yardstick.verdicts import (
-    curve_band,
-    mean_over_runs,
-    on_grid,
-    performance_profile,
-    shared_grid,
-    steps_to_threshold,
-    summarise,
-    summarise_steps,
-)
+from rl_yardstick import verdicts
 from rl_yardstick.verdicts.estimates import median_over_runs, share_interval
 
 INF, NAN = math.inf, math.nan
@@ -25,18 +16,15 @@ def ends(found):
     return found.low, found.high
 
 
-# --- figures over runs ----------------------------------------------------------------------------
-
-
 def test_a_mean_has_students_interval_cut_at_what_is_possible():
     runs = np.array([3.0, 5, 4, 8, 6])
-    found = mean_over_runs([*runs, NAN])
+    found = verdicts.mean_over_runs([*runs, NAN])
     assert (found.point, found.n, found.n_missing) == (pytest.approx(5.2), 5, 1)
     low, high = stats.t.interval(0.95, 4, runs.mean(), stats.sem(runs))
     assert ends(found) == pytest.approx((low, high))
-    assert ends(mean_over_runs(runs, (4, 6))) == (4, 6)
+    assert ends(verdicts.mean_over_runs(runs, (4, 6))) == (4, 6)
     # Bounds that the runs contradict do not move the mean out of its interval.
-    assert ends(mean_over_runs(runs, (0, 5))) == pytest.approx((low, 5.2))
+    assert ends(verdicts.mean_over_runs(runs, (0, 5))) == pytest.approx((low, 5.2))
 
 
 @pytest.mark.parametrize(
@@ -46,18 +34,15 @@ def test_a_mean_has_students_interval_cut_at_what_is_possible():
         ([0.1] * 7, 0.1, (0.1, 0.1)),
         ([3.0, 1.0, 2.0, 2.0], 2, (1, 3)),  # below five runs their range
         ([4.0], 4, (4, 4)),
+        ([], NAN, (NAN, NAN)),
+        ([NAN, INF], NAN, (NAN, NAN)),
     ],
 )
-def test_equal_and_few_runs(runs, point, interval):
-    found = mean_over_runs(runs)
-    assert (found.point, ends(found), found.is_range) == (point, interval, len(runs) < 5)
-
-
-@pytest.mark.parametrize("runs", [[], [NAN], [NAN, INF]])
-def test_without_a_run_there_is_no_figure(runs):
-    found = mean_over_runs(runs)
-    assert np.isnan([found.point, found.low, found.high]).all()
-    assert found.n_missing == len(runs)
+def test_equal_few_and_no_runs(runs, point, interval):
+    found = verdicts.mean_over_runs(runs)
+    assert [found.point, *ends(found)] == pytest.approx([point, *interval], abs=0, nan_ok=True)
+    assert found.is_range == (len(runs) < 5)
+    assert found.n_missing == (len(runs) if math.isnan(point) else 0)
 
 
 @pytest.mark.parametrize("n", [6, 9, 16, 30])
@@ -67,34 +52,20 @@ def test_the_interval_of_the_median_covers_and_is_the_shortest_that_does(n):
     assert (found.point, found.high) == ((n - 1) / 2, n - 1 - cut)
     covered = [1 - 2 * stats.binom.cdf(outside, n, 0.5) for outside in (cut, cut + 1)]
     assert covered[0] >= 0.95 > covered[1]
-
-
-def test_five_runs_have_their_range_as_interval_of_the_median():
-    assert ends(median_over_runs([5, 1, 2, 4, 3])) == (1, 5)
+    assert ends(median_over_runs([5, 1, 2, 4, 3])) == (1, 5)  # where no interval covers
 
 
 def test_the_middle_half():
     # Two of eight are left out on each side, one of seven.
-    assert summarise([0.0, 1, 2, 3, 5, 6, 7, 100]).iqm == 4
-    assert summarise([0.0, 1, 2, 3, 4, 5, 100, NAN]).iqm == 3
-    assert summarise([0.5] * 4).iqm == 0.5
+    assert verdicts.summarise([0.0, 1, 2, 3, 5, 6, 7, 100]).iqm == 4
+    assert verdicts.summarise([0.0, 1, 2, 3, 4, 5, 100, NAN]).iqm == 3
+    assert verdicts.summarise([0.5] * 4).iqm == 0.5
 
 
 def test_a_share_has_the_interval_of_clopper_and_pearson():
     for count, n in ((0, 10), (3, 10), (10, 10), (1, 200)):
         exact = stats.binomtest(count, n).proportion_ci(0.95, method="exact")
         assert share_interval(count, n) == pytest.approx((exact.low, exact.high))
-
-
-@pytest.mark.parametrize("n", [5, 30])
-def test_intervals_over_normal_runs_cover(n):
-    """Of 2,000 intervals; the standard error is 0.005 at 0.95."""
-    draws = np.random.default_rng(7).normal(3, 2, (2000, n))
-    found = [ends(mean_over_runs(runs)) for runs in draws]
-    assert np.mean([low <= 3 <= high for low, high in found]) == pytest.approx(0.95, abs=0.02)
-
-
-# --- one curve ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -112,39 +83,40 @@ def test_intervals_over_normal_runs_cover(n):
 )
 def test_steps_to_a_threshold(values, threshold, first, to_stay):
     steps = [10, 20, 30, 40]
-    assert steps_to_threshold(steps, values, threshold) == pytest.approx(first, nan_ok=True)
-    found = steps_to_threshold(steps, values, threshold, to_stay=True)
+    assert verdicts.steps_to_threshold(steps, values, threshold) == pytest.approx(
+        first, nan_ok=True
+    )
+    found = verdicts.steps_to_threshold(steps, values, threshold, to_stay=True)
     assert found == pytest.approx(to_stay, nan_ok=True)
 
 
 def test_curves_that_are_none_are_refused():
     with pytest.raises(ValueError, match="fall after step 20"):
-        on_grid([10, 20, 15], [0, 0, 0], [0])
+        verdicts.on_grid([10, 20, 15], [0, 0, 0], [0])
     with pytest.raises(ValueError, match=r"steps of shape \(2,\) and values of shape \(3,\)"):
-        on_grid([0, 1], [0, 0, 0], [0])
+        verdicts.on_grid([0, 1], [0, 0, 0], [0])
     with pytest.raises(ValueError, match="shape"):
-        steps_to_threshold([], [], 1)
-
-
-# --- several curves -------------------------------------------------------------------------------
+        verdicts.steps_to_threshold([], [], 1)
 
 
 def test_the_shared_grid_is_where_all_curves_are():
-    assert shared_grid([[0, 10, 20, 30], [5, 10, 25]]).tolist() == [5, 10, 20, 25]
+    assert verdicts.shared_grid([[0, 10, 20, 30], [5, 10, 25]]).tolist() == [5, 10, 20, 25]
     long = np.arange(1001)
-    assert shared_grid([long, long[:901]], n_points=4).tolist() == [0, 300, 600, 900]
+    assert verdicts.shared_grid([long, long[:901]], n_points=4).tolist() == [0, 300, 600, 900]
     with pytest.raises(ValueError, match="ends at step 3 before another begins, at step 4"):
-        shared_grid([[1, 3], [4, 5]])
+        verdicts.shared_grid([[1, 3], [4, 5]])
     with pytest.raises(ValueError, match="without evaluations"):
-        shared_grid([[1, 3], []])
+        verdicts.shared_grid([[1, 3], []])
 
 
 def test_a_curve_on_a_grid_holds_its_latest_value():
     grid = [0, 10, 14.9, 20, 99]
-    assert on_grid([10, 20], [1, 2], grid).tolist() == pytest.approx([NAN, 1, 1, 2, 2], nan_ok=True)
+    assert verdicts.on_grid([10, 20], [1, 2], grid).tolist() == pytest.approx(
+        [NAN, 1, 1, 2, 2], nan_ok=True
+    )
     # Two evaluations at one step: the later one.
-    assert on_grid([10, 10, 20], [1, 5, 2], [10]).tolist() == [5]
-    assert on_grid([10, 20], [[1, 2], [3, 4]], [15, 25]).tolist() == [[1, 2], [3, 4]]
+    assert verdicts.on_grid([10, 10, 20], [1, 5, 2], [10]).tolist() == [5]
+    assert verdicts.on_grid([10, 20], [[1, 2], [3, 4]], [15, 25]).tolist() == [[1, 2], [3, 4]]
 
 
 def test_a_band_is_the_mean_over_runs_at_each_point():
@@ -153,27 +125,27 @@ def test_a_band_is_the_mean_over_runs_at_each_point():
     values[:, 2] = 0.1  # equal values keep theirs to the last bit
     values[:3, 3] = NAN  # few runs
     values[:, 4] = INF
-    band = curve_band(values, (-1, 0.5))
+    band = verdicts.curve_band(values, (-1, 0.5))
     for place, column in enumerate(values.T):
-        one = mean_over_runs(column, (-1, 0.5))
+        one = verdicts.mean_over_runs(column, (-1, 0.5))
         found = [band.point[place], band.low[place], band.high[place]]
         assert found == pytest.approx([one.point, *ends(one)], abs=1e-12, nan_ok=True)
     assert (band.low[2], band.point[2], band.high[2]) == (0.1, 0.1, 0.1)
 
 
 def test_steps_over_runs_worked_by_hand():
-    summary = summarise_steps([300, 100, INF, 200, INF, 500, 400, NAN])
+    summary = verdicts.summarise_steps([300, 100, INF, 200, INF, 500, 400, NAN])
     # Sorted 100 200 300 400 500 inf inf: P(Bin(7, 1/2) = 0) = 1/128, so the extremes, at 98.4 %.
     assert (summary.median.point, *ends(summary.median)) == (400, 100, INF)
     assert (summary.median.n, summary.median.n_missing) == (7, 1)
     assert summary.share_reached.point == pytest.approx(5 / 7)
     assert ends(summary.share_reached) == pytest.approx(share_interval(5, 7))
-    assert summarise_steps([INF, 5, INF, 7, INF]).median.point == INF
-    assert summarise_steps([INF] * 4).share_reached.point == 0
-    assert np.isnan(summarise_steps([NAN]).share_reached.point)
+    assert verdicts.summarise_steps([INF, 5, INF, 7, INF]).median.point == INF
+    assert verdicts.summarise_steps([INF] * 4).share_reached.point == 0
+    assert np.isnan(verdicts.summarise_steps([NAN]).share_reached.point)
 
 
 def test_a_profile_worked_by_hand():
-    profile = performance_profile([[0.0, 1.0], [0.5, 1.0], [1.0, NAN]], [-1, 0, 0.5, 1])
+    profile = verdicts.performance_profile([[0.0, 1.0], [0.5, 1.0], [1.0, NAN]], [-1, 0, 0.5, 1])
     # Strictly above: of the three and of the two, averaged over the two environments.
     assert profile.tolist() == pytest.approx([1, 5 / 6, 4 / 6, 0])

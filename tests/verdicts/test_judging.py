@@ -1,6 +1,7 @@
 """Words on pairs of agents: against SciPy's tests, by hand, and their logic on any scores."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,9 +29,6 @@ def pair_of(study, environment, first, second):
 def drawn(seed, n, *means, spread=0.1):
     rng = np.random.default_rng(seed)
     return {f"a{k}": rng.normal(mean, spread, n) for k, mean in enumerate(means)}
-
-
-# --- the tests ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n", [(8, 8), (6, 20)])
@@ -95,9 +93,6 @@ def test_an_agent_without_chance_is_known():
     both = judge({"w": {"plan": [1.0], "same": [0.99]}}, certain={("w", "plan"), ("w", "same")})
     assert (only(both).word, only(both).p_tied) == ("tied", 0.0)
     assert only(both).interval == pytest.approx((0.01, 0.01))
-
-
-# --- the words ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -195,9 +190,6 @@ def test_so_many_seeds_as_are_said_to_be_needed_decide():
     assert (word_with(needed), word_with(int(needed * 0.95))) == (word, "undecided")
 
 
-# --- agents ---------------------------------------------------------------------------------------
-
-
 def test_the_figures_of_an_agent():
     runs = [1.0, 0.9, 0.2, 0.95, 1.0, NAN]
     study = judge({"w": {"x": runs, "y": [0.8] * 6}}, bounds=(0, 1))
@@ -231,9 +223,6 @@ def test_arguments_out_of_range_are_named():
     for wrong in ({"level": 0.5}, {"level": 0.0}, {"n_looks": 0}, {"margin": -0.1}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             judge({"w": {"x": [1.0]}}, **wrong)
-
-
-# --- growing studies ------------------------------------------------------------------------------
 
 
 def test_looks_share_the_level_and_decided_pairs_keep_their_word():
@@ -272,3 +261,37 @@ def test_a_study_ends_where_all_is_decided_or_no_seed_is_left():
     assert (study.n_looks, study.is_done, only(study).n) == (4, True, 80)
     # An agent whose runs all crash gets no more.
     assert judge({"w": {"x": np.ones(10), "y": np.full(10, NAN)}}, looks=(10, 20)).is_done
+
+
+BANK = Path(__file__).parents[2] / "benchmarks" / "verdict_bank.npz"
+N_STUDIES = 200
+# At an error rate of 5 %, more of 200 studies are false with a probability of 0.0012 (binomial).
+MOST_FALSE = 20
+
+
+@pytest.mark.parametrize("kind", ["different agents", "the same agent"])
+@pytest.mark.parametrize("n_seeds", [5, 10])
+def test_at_most_one_study_in_twenty_has_a_false_better_or_worse(kind, n_seeds):
+    """Studies drawn from the final scores of real runs, whose true means are known."""
+    with np.load(BANK) as stored:
+        bank = {name: stored[name].astype(float) for name in stored.files}
+    by_env, rng, signs = {}, np.random.default_rng(n_seeds), {"better": 1, "worse": -1}
+    for name in bank:
+        by_env.setdefault(name.partition("|")[0], []).append(name)
+    large = [names for names in by_env.values() if len(names) >= 4]
+    varying = [name for name, scores in bank.items() if np.ptp(scores) > 0]
+    n_false = n_given = 0
+    for _ in range(N_STUDIES):
+        if kind == "the same agent":
+            chosen = dict(zip("abcd", [rng.choice(varying)] * 4, strict=True))
+        else:
+            names = rng.permutation(large[rng.integers(len(large))])[:4]
+            chosen = dict(zip("abcd", names, strict=True))
+        runs = {letter: rng.choice(bank[name], n_seeds) for letter, name in chosen.items()}
+        true = {letter: bank[name].mean() for letter, name in chosen.items()}
+        study = judge({"env": runs}, bounds=(-1.0, 1.0), margin=0.02)
+        said = [pair for pair in study.pairs if pair.word in signs]
+        n_given += len(said)
+        n_false += any(signs[p.word] * (true[p.first] - true[p.second]) <= 0 for p in said)
+    assert n_false <= MOST_FALSE
+    assert n_given > N_STUDIES or kind == "the same agent"  # words are given at all

@@ -1,53 +1,46 @@
 """Hand-written tables in single files, as people write them, each right or with one fault."""
 
-from __future__ import annotations
-
 import random
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-Table = NDArray[np.float64]
+import torch as th
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.buffers import RolloutBuffer
 
 
 class Agent:
     """A table, and how it acts."""
 
-    def __init__(self, table: Table, epsilon: float = 0.0) -> None:
+    def __init__(self, table, epsilon=0.0):
         self.table, self.epsilon = table, epsilon
 
-    def act(self, obs: Any) -> int:
-        """The best action, or sometimes another one."""
+    def act(self, obs):
         if random.random() < self.epsilon:  # noqa: S311 (as people write it)
             return random.randrange(self.table.shape[1])  # noqa: S311
         return int(self.table[number(obs)].argmax())
 
-    def values(self, obs: Any) -> Table:
-        """The values of both actions."""
-        values: Table = self.table[number(obs)]
-        return values
+    def values(self, obs):
+        return self.table[number(obs)]
 
 
-def number(obs: Any) -> int:
+def number(obs):
     """The state, of its number or of a vector with a one."""
     return int(np.argmax(obs)) if np.ndim(obs) else int(obs)
 
 
 def one_step(
-    make_env: Callable[[], Any],
-    seed: int,
-    gamma: float,
-    steps: int,
-    exploration_initial_eps: float = 1.0,
-    exploration_final_eps: float = 0.1,
-    lam: float = 0.0,
-    learning_rate: float = 0.1,
+    make_env,
+    seed,
+    gamma,
+    steps,
+    exploration_initial_eps=1.0,
+    exploration_final_eps=0.1,
+    lam=0.0,
+    learning_rate=0.1,
     *,
-    target: str = "max",
-    fault: str = "",
-) -> Agent:
+    target="max",
+    fault="",
+):
     """Q-learning, SARSA or Expected SARSA, also with replacing traces."""
     env, rng = make_env(), np.random.default_rng(None if fault == "not-reproducible" else seed)
     q = np.zeros((env.observation_space.n, env.action_space.n))
@@ -55,7 +48,7 @@ def one_step(
     discount = {"discount-twice": gamma**2, "discount-missing": 1.0}.get(fault, gamma)
     fading = lam if fault == "lambda-alone" else gamma * lam
 
-    def choose(state: int) -> int:
+    def choose(state):
         drawn = np.random if fault == "global-generator" else rng
         if drawn.random() < epsilon:
             return int(rng.integers(len(q[state])))
@@ -90,20 +83,12 @@ def one_step(
     return Agent(q, 0.05 if fault == "explores-in-evaluation" else 0.0)
 
 
-def from_memory(
-    make_env: Callable[[], Any],
-    seed: int,
-    gamma: float,
-    steps: int,
-    buffer_size: int = 500,
-    *,
-    fault: str = "",
-) -> Agent:
+def from_memory(make_env, seed, gamma, steps, buffer_size=500, *, fault=""):
     """Q-learning on a table from a memory of steps, whose observations are vectors."""
     env, rng = make_env(), np.random.default_rng(seed)
     n_states = env.observation_space.shape[0]
     q, place = np.zeros((n_states, env.action_space.n)), 0
-    memory: list[tuple[Any, int, float, Any, bool]] = []
+    memory = []
     obs, _ = env.reset(seed=seed)
     for _ in range(steps):
         kept = obs if fault == "shared-buffer" else obs.copy()
@@ -124,15 +109,7 @@ def from_memory(
     return Agent(q)
 
 
-def several_steps(
-    make_env: Callable[[], Any],
-    seed: int,
-    gamma: float,
-    steps: int,
-    n_steps: int = 3,
-    *,
-    fault: str = "",
-) -> Agent:
+def several_steps(make_env, seed, gamma, steps, n_steps=3, *, fault=""):
     """n-step SARSA."""
     env, rng = make_env(), np.random.default_rng(seed)
     q = np.zeros((env.observation_space.n, env.action_space.n))
@@ -141,25 +118,18 @@ def several_steps(
     for _ in range(steps):
         following, reward, terminated, truncated, _ = env.step(action)
         window.append((obs, action, reward))
-        next_action = int(rng.integers(q.shape[1]))
-        done = terminated or truncated
+        next_action, done = int(rng.integers(q.shape[1])), terminated or truncated
         ahead = 0.0 if terminated else q[following, next_action]
         while window and (done or len(window) >= n_steps):
-            n = len(window)
-            faded = 1.0 if fault == "n-step-return" else gamma
+            n, faded = len(window), 1.0 if fault == "n-step-return" else gamma
             total = sum(faded**k * paid for k, (_, _, paid) in enumerate(window))
             then, did, _ = window.pop(0)
             q[then, did] += 0.1 * (total + gamma**n * ahead - q[then, did])
-        obs, action = following, next_action
-        if done:
-            obs, _ = env.reset()
-            window = []
+        obs, action = env.reset()[0] if done else following, next_action
     return Agent(q)
 
 
-def preferences(
-    make_env: Callable[[], Any], seed: int, gamma: float, steps: int, *, fault: str = ""
-) -> Any:
+def preferences(make_env, seed, gamma, steps, *, fault=""):
     """One-step actor-critic on tables, with a softmax of preferences."""
     env, rng = make_env(), np.random.default_rng(seed)
     likes = np.zeros((env.observation_space.n, env.action_space.n))
@@ -178,7 +148,102 @@ def preferences(
         obs = env.reset()[0] if terminated or truncated else following
 
     class ActorCritic(Agent):
-        def values(self, obs: Any) -> Table:
+        def values(self, obs):
             return v[[number(obs)]]
 
     return ActorCritic(likes)
+
+
+MEMORIES = {}
+
+
+class DQNSharesMemory(DQN):
+    """Has one memory for all agents of the class, as a mutable default would make it."""
+
+    def _setup_model(self):
+        key = f"{self.observation_space} {self.action_space} {self.buffer_size}"
+        self.replay_buffer = MEMORIES.get(key)
+        super()._setup_model()
+        MEMORIES[key] = self.replay_buffer
+
+
+class DQNNeverCopies(DQN):
+    """Its target network stays as it began."""
+
+    def _on_step(self):
+        tau, self.tau = self.tau, 0.0
+        super()._on_step()
+        self.tau = tau
+
+
+class DQNAlwaysCopies(DQN):
+    """Its target network follows at each training."""
+
+    def train(self, gradient_steps, batch_size=100):
+        self.q_net_target.load_state_dict(self.q_net.state_dict())
+        super().train(gradient_steps, batch_size)
+
+
+class DQNWithoutOptimizer(DQN):
+    """Saves its weights alone."""
+
+    def _get_torch_save_params(self):
+        return ["q_net", "q_net_target"], []
+
+
+class PPOEntropy(PPO):
+    """Entropy is made small."""
+
+    def train(self):
+        weight, self.ent_coef = self.ent_coef, -self.ent_coef
+        super().train()
+        self.ent_coef = weight
+
+
+class PPORatio(PPO):
+    """Old by new, instead of new by old."""
+
+    def train(self):
+        evaluate = self.policy.evaluate_actions
+
+        def turned_round(*args):
+            values, log_prob, entropy = evaluate(*args)
+            return values, -log_prob, entropy
+
+        self.policy.evaluate_actions = turned_round
+        self.rollout_buffer.log_probs *= -1
+        super().train()
+        del self.policy.evaluate_actions
+
+
+class GAEWithoutLambda(RolloutBuffer):
+    """Advantages that fade by gamma alone."""
+
+    def compute_returns_and_advantage(self, last_values, dones):
+        decay, self.gae_lambda = self.gae_lambda, float(self.gae_lambda > 0)
+        super().compute_returns_and_advantage(last_values, dones)
+        self.gae_lambda = decay
+
+
+class PPOTraces(PPO):
+    """Its advantages do not fade by lambda."""
+
+    def __init__(self, *args, **kwargs):
+        kwargs.setdefault("rollout_buffer_class", GAEWithoutLambda)
+        super().__init__(*args, **kwargs)
+
+
+class ForgetfulDQN(DQN):
+    """Its weights are not in the file, but zeros."""
+
+    def get_parameters(self):
+        parameters = super().get_parameters()
+        weights = parameters["policy"].items()
+        return {**parameters, "policy": {name: th.zeros_like(part) for name, part in weights}}
+
+
+class ForgetfulPPO(PPO):
+    """Its learning rate's schedule is not in the file."""
+
+    def _excluded_save_params(self):
+        return [*super()._excluded_save_params(), "learning_rate", "lr_schedule"]

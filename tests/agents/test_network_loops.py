@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
@@ -22,6 +21,7 @@ import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon
 from rl_yardstick.envs.wrappers import OneHotObservation
+from tests.agents.trainings import Every, Plain
 
 TOLERANCE = 1e-4  # what rounding comes to after a few hundred steps
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -105,27 +105,6 @@ CASES = {  # agent, environment, how many, episodes between two records, setting
     "a2c with decay": (
         "a2c", pole, 1, 3, policy(RMSpropTFLike, eps=1e-5, weight_decay=0.1)),
 }  # fmt: skip
-
-
-class Plain(BaseCallback):
-    """Has to be asked after each step, so that the library's loop runs with compiled parts."""
-
-    def _on_step(self):
-        return True
-
-
-class Every(BlockCallback):
-    """Does something on every so many calls, and lets blocks be no longer than that."""
-
-    def __init__(self, calls, do=lambda model: None):
-        super().__init__()
-        self.calls, self.do = calls, do
-
-    def horizon(self):
-        return Horizon(calls=self.calls - self.n_calls % self.calls)
-
-    def _on_step(self):
-        return self.n_calls % self.calls != 0 or self.do(self.model) is not False
 
 
 class Lists(KVWriter):
@@ -294,9 +273,8 @@ def test_compiled_training_does_what_the_library_does_wherever_blocks_end(case):
     assert ours.exact == theirs.exact
     for each, other in zip(ours.close, theirs.close, strict=True):
         np.testing.assert_allclose(each, other, rtol=TOLERANCE, atol=TOLERANCE)
-    assert [(step, [*record]) for step, record in dumps] == [
-        (step, [*record]) for step, record in expected
-    ]
+    names, others = ([(step, [*record]) for step, record in each] for each in (dumps, expected))
+    assert names == others
     logged, other = (
         [v for _, record in each for v in record.values()] for each in (dumps, expected)
     )
@@ -321,8 +299,6 @@ def test_compiled_training_does_what_the_library_does_wherever_blocks_end(case):
 def of_rollouts(record):
     return {key: value for key, value in record.items() if key.startswith("rollout/")}
 
-
-# --- stops ---------------------------------------------------------------------------
 
 MODES = ("parts", "compiled")
 
