@@ -10,7 +10,7 @@ import pytest
 from rl_yardstick.agents import ALGORITHMS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-FORM = ["Idea", "Update", "Pseudo-code, and the code that runs", "By hand", "When it fails"]
+FORM = ["Idea", "Update", "The code", "By hand", "When it fails"]
 FORM += ["See it", "Source"]
 
 
