@@ -2,12 +2,11 @@
 
 The limits are only in the table there under "Size". A row names, in code marks, folders (whose
 Python files count) or patterns; the row "together" is the sum of the rows above it. Only files
-under version control count. With ``--check`` it fails if a limit is exceeded.
+under version control count. It fails if a limit is exceeded.
 """
 
 from __future__ import annotations
 
-import argparse
 import re
 import subprocess
 import sys
@@ -38,10 +37,7 @@ class Size(NamedTuple):
 
 
 def main() -> int:
-    """Print a table of all parts; with ``--check``, 1 if one is too large."""
-    parser = argparse.ArgumentParser(description="Count lines and files against their limits.")
-    parser.add_argument("--check", action="store_true", help="fail where a limit is exceeded")
-    arguments = parser.parse_args()
+    """Print a table of all parts; 1 if one is too large."""
     lengths = lengths_of_files(ROOT)
     limits = read_limits(PAGE.read_text(encoding="utf-8"))
     sizes = sizes_of(limits, lengths)
@@ -59,7 +55,7 @@ def main() -> int:
     rest = [path for path in lengths if path.endswith(".py") and not matches(path, counted)]
     print(f"{'Python in no row':42}{sum(lengths[path] for path in rest):8,}{'':15}{len(rest):7,}")
     print(f"{exceeded} of {len(limits)} parts are too large")
-    return int(arguments.check and exceeded > 0)
+    return int(exceeded > 0)
 
 
 def lengths_of_files(root: Path) -> dict[str, int]:
