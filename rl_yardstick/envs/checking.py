@@ -281,6 +281,8 @@ class Trial:
         rows = np.array([row for row in self.n_of_row if row != START])
         was_set = self.model.n_states == 1
         for row in self._rng.choice(rows, N_ATTEMPTS).tolist():
+            if self.over or self.time >= self.limit:
+                self._reset()
             stayed = self.state * self.n_actions + row % self.n_actions
             try:
                 seen = self._step(*divmod(row, self.n_actions))
