@@ -103,7 +103,7 @@ def before_counting(agent: ScoreAgent, pull: Any, progress: Any) -> None:
 @inlined
 def total_count(tables: Any, row: int) -> int:
     """Number of rewards seen in a context, including those of masked arms."""
-    total = tables.other_count
+    total: int = tables.other_count
     for arm in range(tables.counts.shape[1]):
         total += tables.counts[row, arm]
     return total
@@ -112,7 +112,7 @@ def total_count(tables: Any, row: int) -> int:
 @inlined
 def mean_reward(tables: Any, row: int) -> float:
     """Average of all rewards seen in a context; there must be at least one."""
-    total = tables.other_sum
+    total: float = tables.other_sum
     for arm in range(tables.sums.shape[1]):
         total += tables.sums[row, arm]
     return total / total_count(tables, row)

@@ -311,11 +311,11 @@ class Runs:
         self.rewards = np.empty(shape, np.float32)
         self.regrets = np.empty(shape)
         self.contexts = np.empty(shape, np.int32)
-        self.known = {
+        self.known: dict[str, Any] = {
             name: np.repeat(value.numpy()[None], len(seeds), axis=0)
             for name, value in agent.policy.state_dict().items()
         }
-        self.kept = {
+        self.kept: dict[str, Any] = {
             name: np.empty((len(seeds), len(self.moments), *known.shape[1:]), known.dtype)
             for name, known in self.known.items()
         }
