@@ -315,7 +315,7 @@ class Runs:
             name: np.repeat(value.numpy()[None], len(seeds), axis=0)
             for name, value in agent.policy.state_dict().items()
         }
-        self.kept = {
+        self.kept: dict[str, Any] = {
             name: np.empty((len(seeds), len(self.moments), *known.shape[1:]), known.dtype)
             for name, known in self.known.items()
         }
