@@ -378,7 +378,7 @@ def _checked(name: str, value: Any, kinds: list[str]) -> Any:
     limits = _RANGE_OF.get(name)
     expected: Any = typing.Union[tuple(plain)]  # noqa: UP007
     try:
-        given = expected if limits is None or str in plain else Annotated[expected, limits]
+        given: Any = expected if limits is None or str in plain else Annotated[expected, limits]
         found = TypeAdapter(given).validate_python(value)
     except ValidationError as error:
         reason = error.errors()[0]["msg"]

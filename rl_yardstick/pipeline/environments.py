@@ -249,7 +249,7 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
     found = dict(entry)
     for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
-        kwargs = found.get(key) if isinstance(found.get(key), dict) else {}
+        kwargs: Any = found.get(key) if isinstance(found.get(key), dict) else {}
         desc, log = kwargs.get("desc"), kwargs.get("log")
         if isinstance(desc, str) and _makes(env_id, GridWorld):
             try:
@@ -266,7 +266,7 @@ def map_name(env_id: str, entry: Mapping[str, Any]) -> str:
     from rl_yardstick.envs.grid import GridWorld
 
     parts = [entry.get(key) or {} for key in ("eval_env_kwargs", "env_kwargs")]
-    given = next((part["desc"] for part in parts if "desc" in part), None)
+    given: Any = next((part["desc"] for part in parts if "desc" in part), None)
     is_path = isinstance(given, str) and "\n" not in given and _makes(env_id, GridWorld)
     return Path(given).name if is_path else ""
 
