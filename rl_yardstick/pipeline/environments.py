@@ -249,7 +249,7 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
     found = dict(entry)
     for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
-        kwargs: dict[str, Any] = given if isinstance(given := found.get(key), dict) else {}
+        kwargs: Any = found.get(key) if isinstance(found.get(key), dict) else {}
         desc, log = kwargs.get("desc"), kwargs.get("log")
         if isinstance(desc, str) and _makes(env_id, GridWorld):
             try:

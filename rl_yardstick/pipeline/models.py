@@ -180,8 +180,8 @@ def _spec_of(path: Path, data: Mapping[str, Any], wanted: Wanted) -> TrainSpec:
     args, config = saved if saved else (dict[str, Any](), None)
     end = f":{data.get('algorithm')}"  # the class of a hand-written agent
     own = [name for name, one in ALGORITHMS.items() if one.entry_point.endswith(end)]
-    algo: Any = wanted.algo or next(iter(own), args.get("algo"))
-    env_id: Any = wanted.env_id or args.get("env")
+    algo = wanted.algo or next(iter(own), args.get("algo", ""))
+    env_id = wanted.env_id or args.get("env", "")
     if not (algo and env_id):
         missing = "--env" if algo else "--algo"
         raise UserError(f"{path} is in no run folder: say what it is with {missing}")
@@ -351,14 +351,13 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
     if "n_steps" in given and issubclass(load_algorithm(spec.algo), OffPolicyAlgorithm):
         # The library chooses the buffer's class by ``n_steps``, and would keep the file's class.
         given = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, **given}
-    agent = load(spec, path, env, **given)
+    agent: Any = load(spec, path, env, **given)
     if (statistics := statistics_of(path)) is not None and agent.get_vec_normalize_env():
         take_statistics(env, statistics)
     buffer = replay_buffer_of(path)
-    if buffer is None or not isinstance(agent, OffPolicyAlgorithm):
-        return agent
-    content = io.BytesIO(read_bytes(buffer, MAX_MODEL))
-    wanted: Any = agent.replay_buffer
+    if buffer is None or not issubclass(load_algorithm(spec.algo), OffPolicyAlgorithm):
+        return agent  # type: ignore[no-any-return]
+    content, wanted = io.BytesIO(read_bytes(buffer, MAX_MODEL)), agent.replay_buffer
     try:
         load_replay_buffer(agent, content, classes={MaskedReplayBuffer, type(wanted)})
     except (ValueError, AssertionError) as error:
@@ -369,4 +368,4 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
     )
     if found != needed:
         raise UserError(f"{buffer} holds a {found}; these hyperparameters need a {needed}")
-    return agent
+    return agent  # type: ignore[no-any-return]
