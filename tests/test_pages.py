@@ -125,7 +125,4 @@ def test_blocks_of_the_headline_study_are_replaced_and_the_others_stay():
     assert {
         path.name: {block[2] for block in headline.BLOCK.finditer(path.read_text(encoding="utf-8"))}
         for path in headline.PAGES
-    } == {
-        "README.md": {"held-out"},
-        "library-vs-hand-rolled.md": {"held-out"},
-    }
+    } == {"README.md": {"held-out"}, "library-vs-hand-rolled.md": {"held-out"}}

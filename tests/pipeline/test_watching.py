@@ -78,13 +78,7 @@ SMALL_PPO = {"n_steps": 32, "batch_size": 32}
 SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradient_steps": 2}
 
 
-@pytest.mark.parametrize(
-    ("algo", "settings"),
-    [
-        ("qlearning", {}),
-        ("ppo", SMALL_PPO),
-    ],
-)
+@pytest.mark.parametrize(("algo", "settings"), [("qlearning", {}), ("ppo", SMALL_PPO)])
 def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
     spec = watched_spec(algo, settings, n_timesteps=160)
     alone, plain = run_of(spec.changed(watch_learning=None), tmp_path)

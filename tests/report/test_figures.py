@@ -14,12 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FixedLocator, PercentFormatter
 
 from rl_yardstick.experiments.analysis import OverallAnalysis
-from rl_yardstick.report.figures import (
-    draw_learning_curves,
-    draw_runs,
-    label_ends,
-    write_figures,
-)
+from rl_yardstick.report.figures import draw_learning_curves, draw_runs, label_ends, write_figures
 from rl_yardstick.report.series import (
     COLOURS,
     AgentRuns,

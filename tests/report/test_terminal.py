@@ -10,11 +10,7 @@ import pytest
 
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.experiments.off_policy import Comparison, Judged, PolicyTerms
-from rl_yardstick.report.terminal import (
-    print_analysis,
-    print_comparison,
-    print_episodes_table,
-)
+from rl_yardstick.report.terminal import print_analysis, print_comparison, print_episodes_table
 from tests.report import made_up
 
 NAMES = ["double_expected_sarsa_with_a_long_name", "an agent of many short words here", "x"]
