@@ -18,7 +18,7 @@ from rl_yardstick.pipeline.evaluation.histories import by_histories, world_of_me
 from rl_yardstick.pipeline.evaluation.policies import action_figures, policy_matrix
 from rl_yardstick.pipeline.evaluation.sampled import evaluate
 from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick, with_memory
-from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, trained
+from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of
 from tests.pipeline.short_runs import spec_of as spec_for
 
 # Two-sided, of the normal distribution.
@@ -31,16 +31,11 @@ SMALL = {"policy_kwargs": {"net_arch": [16]}, "device": "cpu"}
 PROBS = {"probabilities": [0.2, 0.5, 0.9], "pulls": 100}
 BANDIT = {"env_kwargs": PROBS}
 AGENTS = {
-    "qlearning": (
-        5000,
-        {"learning_rate": 0.5, "exploration_final_eps": 0.3, "engine": "interpreted"},
-    ),
-    "ppo": (256, {**SMALL, "n_steps": 64, "batch_size": 64, "n_epochs": 2}),
-    "dqn": (
-        300,
-        {**SMALL, "buffer_size": 500, "learning_starts": 50, "exploration_final_eps": 0.2},
-    ),
+    "qlearning": {"learning_rate": 0.5, "exploration_final_eps": 0.3, "engine": "interpreted"},
+    "ppo": {**SMALL, "n_steps": 64, "batch_size": 64, "n_epochs": 2},
+    "dqn": {**SMALL, "buffer_size": 500, "learning_starts": 50, "exploration_final_eps": 0.2},
 }
+N_STEPS = {"qlearning": 5000, "ppo": 256, "dqn": 300}
 ACT_BY = {"qlearning": "epsilon 0.3", "ppo": "its own distribution", "dqn": "epsilon 0.2"}
 
 
@@ -49,8 +44,7 @@ def spec_of(env_id, entry=None):
 
 
 def briefly_trained(name, spec):
-    n_steps, arguments = AGENTS[name]
-    return agent_of(name, make_training_env(spec, None), **arguments).learn(n_steps)
+    return agent_of(name, make_training_env(spec, None), **AGENTS[name]).learn(N_STEPS[name])
 
 
 @pytest.mark.parametrize(
@@ -156,9 +150,8 @@ def test_bandits_draw_their_arms_by_their_own_rule():
         agent.policy.scores[:] = th.from_numpy(scores)
         found = evaluator.other_returns(agent)
         assert found.acts_by == words
-        assert found.stochastic_return == pytest.approx(
-            100 * np.dot(chances, PROBS["probabilities"])
-        )
+        expected = 100 * np.dot(chances, PROBS["probabilities"])
+        assert found.stochastic_return == pytest.approx(expected)
 
 
 # --- the yardstick -------------------------------------------------------------------------------
@@ -172,10 +165,8 @@ def test_the_best_policy_scores_1_and_the_baseline_one_0():
     assert evaluator(best).summary()["score"] == pytest.approx(1)
     simple = [np.eye(n_actions)[[action] * n_states] for action in range(n_actions)]
     simple.append(np.full((n_states, n_actions), 1 / n_actions))
-    returns = [
-        policy_return(evaluator.model, policy, evaluator.horizon).expected_return
-        for policy in simple
-    ]
+    horizon = evaluator.horizon
+    returns = [policy_return(evaluator.model, one, horizon).expected_return for one in simple]
     assert max(map(evaluator.yardstick.score, returns)) == pytest.approx(0, abs=1e-12)
     assert max(returns) == -1000
     # On the slippery lake the best policy depends on the time that is left.
@@ -213,40 +204,19 @@ def learner_on(desc, name="qlearning", **arguments):
     return exact_evaluator(spec), agent
 
 
-def epsilon_greedy(rows):
-    """With epsilon 1/4; equal values share."""
-    best = rows == rows.max(axis=1, keepdims=True)
-    return 0.25 / 4 + 0.75 * best / best.sum(axis=1, keepdims=True)
-
-
-def boltzmann(rows):
-    weights = np.exp(rows / 0.3)
-    return weights / weights.sum(axis=1, keepdims=True)
-
-
-@pytest.mark.parametrize(
-    ("name", "desc", "chances", "words", "arguments"),
-    [
-        # With as many states as actions, rows can be mistaken for columns.
-        (
-            *("qlearning", ["SF", "FG"], epsilon_greedy, "epsilon 0.25"),
-            {"exploration_final_eps": 0.25},
-        ),
-        (
-            *("sarsa", ["SFF", "FHG"], boltzmann, "temperature 0.3"),
-            {"exploration": "boltzmann", "temperature": 0.3},
-        ),
-    ],
-)
-def test_the_worth_of_exploring(name, desc, chances, words, arguments):
-    """At the last rate of the training."""
-    evaluator, agent = learner_on(desc, name, **arguments)
+def test_the_worth_of_exploring():
+    """With as many states as actions, rows can be mistaken for columns."""
+    arguments = {"exploration": "boltzmann", "temperature": 0.3}
+    evaluator, agent = learner_on(["SF", "FG"], "sarsa", **arguments)
     found = evaluator(agent, deterministic=False)
-    expected = policy_return(evaluator.model, chances(agent.policy.q_table), 12)
+    chances = np.exp(agent.policy.q_table / 0.3)
+    chances /= chances.sum(axis=1, keepdims=True)
+    expected = policy_return(evaluator.model, chances, 12)
     assert found.mean_return == pytest.approx(expected.expected_return, abs=1e-12)
     assert found.lengths[0] == pytest.approx(expected.expected_length, abs=1e-12)
     others = evaluator.other_returns(agent)
-    assert (others.acts_by, others.stochastic_return) == (words, pytest.approx(found.mean_return))
+    assert others.acts_by == "temperature 0.3"
+    assert others.stochastic_return == pytest.approx(found.mean_return)
     # It has learnt something, and exploring costs some of it.
     assert 0.05 < found.mean_return < evaluator(agent).mean_return
 
@@ -501,15 +471,3 @@ def test_all_histories_say_what_many_episodes_say():
     assert abs(sampled.mean_return - exact.mean_return) <= 4 * error + 1e-6
     assert sampled.std_return == pytest.approx(exact.exact_std, rel=0.2, abs=1e-6)
     assert sampled.mean_length == pytest.approx(exact.mean_length, rel=0.05)
-
-
-def test_runs_say_by_which_scale_they_are_measured(tmp_path):
-    brief = {**SHORT, "env_kwargs": {"max_episode_steps": 4}}
-    run, outcome = trained("ppo_lstm", TIGER, brief, n_timesteps=32, folder=tmp_path)
-    assert outcome.final.is_exact
-    assert run.recorded()["final"]["measured_by"] == "memory"
-    plain, _ = trained("qlearning", TIGER, n_timesteps=200, folder=tmp_path)
-    final = plain.recorded()["final"]
-    assert (final["measured_by"], final["optimum"], final["full_optimum"]) == (
-        "observation", -10, 100,
-    )  # fmt: skip

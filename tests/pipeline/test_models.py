@@ -39,9 +39,8 @@ def fallen(progress):
 
 
 def train_to(folder, algo, entry, n_timesteps=200, **fields):
-    return run_of(spec_of(algo, CART, entry, n_timesteps=n_timesteps, **BRIEFLY, **fields), folder)[
-        0
-    ]
+    spec = spec_of(algo, CART, entry, n_timesteps=n_timesteps, **BRIEFLY, **fields)
+    return run_of(spec, folder)[0]
 
 
 def read(path):
@@ -78,6 +77,9 @@ def test_which_model_of_which_run(tmp_path):
     ):
         with pytest.raises(UserError, match=said):
             find_model(wanted)
+    (runs[0].path / "run.json").write_text("{}")
+    with pytest.raises(UserError, match=r"no run folder of this version: run\.json has no spec"):
+        find_model(Wanted(Path(runs[0].path)))
 
 
 # --- statistics of normalisation ------------------------------------------------------------------
@@ -112,13 +114,6 @@ def test_statistics_go_on_unless_the_new_entry_has_none(normalised, tmp_path):
     # Where the entry has nothing, the agent's own settings count.
     assert read(run.path / CART / "vecnormalize.pkl").clip_obs == 3.0
     assert run.spec().normalize["clip_obs"] == 3.0
-
-
-def test_statistics_beside_a_model_that_was_trained_without_are_not_used(normalised, tmp_path):
-    run = train_to(tmp_path, "a2c", SMALL_A2C, 40)
-    content = (normalised.path / CART / "vecnormalize.pkl").read_bytes()
-    (run.path / CART / "vecnormalize.pkl").write_bytes(content)
-    assert find_model(Wanted(run.path)).statistics is None
 
 
 # --- replay buffers -------------------------------------------------------------------------------
@@ -285,10 +280,3 @@ def test_a_setting_that_is_code_is_refused_with_a_way_out(tmp_path, key):
     with pytest.raises(UserError) as refused:
         load(spec_of("ppo", CART), tmp_path / "model.zip", None, device="cpu")
     assert str(refused.value).endswith(end)
-
-
-def test_a_record_without_a_spec_is_told(tmp_path):
-    run = train_to(tmp_path, "a2c", SMALL_A2C, 40)
-    (run.path / "run.json").write_text("{}")
-    with pytest.raises(UserError, match=r"no run folder of this version: run\.json has no spec"):
-        find_model(Wanted(Path(run.path)))

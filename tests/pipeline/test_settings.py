@@ -1,7 +1,6 @@
 """Settings: every text that is read, every mistake in one line, entries, and ``auto``."""
 
 import json
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -139,7 +138,7 @@ MISTAKES = [
 @pytest.mark.parametrize(("algo", "entry", "said"), MISTAKES)
 def test_mistakes_are_one_line(algo, entry, said):
     with pytest.raises(UserError) as caught:
-        read_spec(algo, "FrozenLake-v1", {"n_timesteps": 10, **entry})
+        spec_of(algo, **entry)
     assert said in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
 
@@ -165,17 +164,6 @@ def test_files_that_are_wrong(text, said, tmp_path):
     assert "mine.yml" in str(caught.value)
     with pytest.raises(UserError, match="Python files are not run"):
         read_entry("ppo", "A", tmp_path / "config.py")
-
-
-def test_wrong_hyperparameters_are_refused_before_torch_is_imported():
-    import subprocess
-    import sys
-
-    code = "import sys\nfrom rl_yardstick.pipeline.settings import read_spec\n"
-    code += "try: read_spec('ppo', 'CartPole-v1', {'n_timesteps': 5, 'gama': 1})\n"
-    code += "except Exception as error: print(error, 'torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip().endswith("False")
 
 
 def test_the_table_of_arguments_is_up_to_date():
@@ -270,9 +258,8 @@ def test_every_entry_builds_and_fits_its_agent_and_environment(algo):
         assert constructor_arguments(spec, load_algorithm(algo), False)
         assert TrainSpec.model_validate(json.loads(spec.model_dump_json())) == spec
         # The same settings, given as an entry, are the same training.
-        assert read_spec(algo, env_id, spec.hyperparams).changed(origins={}) == spec.changed(
-            origins={}
-        )
+        again = read_spec(algo, env_id, spec.hyperparams)
+        assert again.changed(origins={}) == spec.changed(origins={})
         check_fit(spec)
         training, evaluation = make_single_env(spec, training=True), make_single_env(spec)
         # What was learnt in the one must be of use in the other.
@@ -339,7 +326,7 @@ POOR = {"shelf_reward": -1, "step_reward": -0.01, "goal_reward": 1}
 )
 def test_the_word_becomes_a_number_of_the_environment(env_id, raw, value):
     algo = "qlearning" if "value_bound" not in raw else "r_max"
-    spec, key = read_spec(algo, env_id, {"n_timesteps": 10, **raw}), next(iter(raw))
+    spec, key = spec_of(algo, env_id, **raw), next(iter(raw))
     assert spec.hyperparams[key] == value
     assert spec.origins[key].startswith("auto")
     assert set(spec.origins) == {name for name in raw if str(raw[name]).startswith("auto")}
@@ -376,32 +363,18 @@ def test_what_cannot_be_worked_out_is_refused(env_id, raw, said, monkeypatch):
     monkeypatch.setattr(gym, "registry", gym.envs.registration.registry)
     gym.register("Unknown-v0", Unknown)
     with pytest.raises(UserError, match=said):
-        read_spec("qlearning", env_id, {"n_timesteps": 10, **raw})
+        spec_of("qlearning", env_id, **raw)
 
 
 @pytest.mark.parametrize(
     ("slip", "gamma", "note"),
     [
-        (
-            0.2,
-            0.99,
-            "at gamma 0.99 even exact planning scores 0.00 here; 0.9995: 1.00 (gamma: auto)",
-        ),
+        (0.2, 0.99, "at gamma 0.99 even exact planning scores 0.00 here; 0.9995: 1.00"),
         (0.2, 0.9995, None),
         (0.0, 0.5, None),  # the shortest way is the best at any discount
     ],
 )
 def test_what_a_discount_costs_is_planned_exactly(slip, gamma, note):
     spec = spec_of("qlearning", "Warehouse-v0", env_kwargs={"slip": slip})
-    assert discount_note(spec, exact_evaluator(spec), gamma) == note
-
-
-def test_paths_of_maps_do_not_reach_a_run(tmp_path, monkeypatch):
-    from rl_yardstick.pipeline.environments import map_name, with_files_read
-
-    (tmp_path / "hall.txt").write_text("S.\n.G\n")
-    entry = {"env_kwargs": {"desc": str(tmp_path / "hall.txt")}, "gamma": 0.9}
-    read = with_files_read("Warehouse-v0", entry)
-    assert read == {"env_kwargs": {"desc": ["S.", ".G"]}, "gamma": 0.9}
-    assert map_name("Warehouse-v0", entry) == Path("hall.txt").name
-    assert map_name("Warehouse-v0", read) == ""
+    found = discount_note(spec, exact_evaluator(spec), gamma)
+    assert found == (note and f"{note} (gamma: auto)")

@@ -329,40 +329,23 @@ def test_nothing_is_cut_by_matplotlibs_own_extents(drawn, tmp_path):
 MARKS = {"first": Mark("first", 1, "dash"), "second": Mark("second", 0, "solid")}
 
 
-def drawn_curves(place, *curves, **evaluation):
-    """Panels of both kinds; the budget of evaluations may be changed."""
-    axes, found = Figure().subplots(1, 2), curves_of(["first", "second"], *curves)
-    found["evaluation"] = replace(found["evaluation"], **evaluation)
-    draw_learning_curves(axes, EnvironmentSeries(place, found, (), None, {}), MARKS)
-    return axes
-
-
 def test_what_stands_beside_curves():
     place = made_up.environment(optimum_at_least=90.0, optimum_is_proven=False)
-    left, _ = drawn_curves(place, 79.0, ("first", "second"))
+    (left, right), names = Figure().subplots(1, 2), ["first", "second"]
+    found = curves_of(names, 79.0, names)
+    found["evaluation"] = replace(found["evaluation"], budget="episode")
+    draw_learning_curves((left, right), EnvironmentSeries(place, found, (), None, {}), MARKS)
+    assert left.get_yscale() != right.get_yscale()
     *lines, legend = described(left.figure)
     assert legend == (
         "names first, second, optimum, at most (not proven), optimum, at least, best random or "
         "constant policy, trained on a variant of the environment, 95 % interval"
     )
-    assert lines[0] == "lake: evaluations | environment steps | return (log scale beyond ±79)"
+    assert lines[0] == "lake: evaluations | episodes | return (log scale beyond ±79)"
     title = "training episodes (2 agents: on a variant of the environment)"
     assert f"{title} | episodes | return" in lines
     ticks = [tick for tick in left.get_yticks() if abs(tick) < 2000]
     assert ticks == [-1000, -300, -100, -50, 0, 50, 100, 300, 1000]
-
-
-@pytest.mark.parametrize(
-    ("scale", "on_variant", "is_shared"),
-    [(None, (), True), (79.0, (), True), (79.0, ("first",), False)],
-)
-def test_panels_of_one_metric_have_one_y_axis_and_evaluations_the_axis_of_the_budget(
-    scale, on_variant, is_shared
-):
-    left, right = drawn_curves(made_up.environment(), scale, on_variant, budget="episode")
-    assert (left.get_ylim() == right.get_ylim()) == is_shared
-    assert (left.get_yscale() == right.get_yscale()) == is_shared
-    assert left.get_xlabel() == "episodes"
 
 
 @pytest.mark.parametrize(
@@ -395,8 +378,3 @@ def test_names_at_the_ends_of_lines_never_overlap_and_make_the_figure_as_tall_as
     inches = axes.get_position().height * figure.get_figheight()
     assert min(np.diff(places)) * inches > 0.11  # eight points of print
     assert 0 <= places[0] < places[-1] <= 1
-
-
-def test_no_two_of_many_agents_have_one_mark():
-    marks = agent_marks(made_up.study([f"agent {n}" for n in range(28)])).values()
-    assert len({(mark.colour, mark.dash) for mark in marks}) == 28

@@ -4,7 +4,7 @@ import base64
 import gzip
 import json
 import re
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -88,19 +88,17 @@ def test_a_page_is_no_larger_than_three_megabytes(watched, page_of, monkeypatch)
     assert max(cut["changes"]["step"]) < n_steps
 
 
-class Here:
+class Here(ThreadPoolExecutor):
     """A pool of this process: another one would import all libraries."""
 
-    def __init__(self, n_workers):
-        self.stop = self.join = lambda: None
+    def stop(self):
+        self.shutdown()
+
+    def join(self):
+        """All is done."""
 
     def submit(self, function, timeout, *args):
-        future = Future()
-        try:
-            future.set_result(function(*args))
-        except Exception as error:  # noqa: BLE001  # as a pool does
-            future.set_exception(error)
-        return future
+        return super().submit(function, *args)
 
 
 def test_each_agent_that_learns_is_shown_once_and_kept(do_study, tmp_path, monkeypatch):

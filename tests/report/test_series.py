@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -13,9 +12,7 @@ from scipy import integrate
 import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.bandits import pull_statistics
-from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.report.series import (
     auer_bound,
     best_expected_reward,
@@ -81,18 +78,6 @@ def test_mean_curves_the_best_agent_first(lake):
     assert (found["evaluation"].on_variant, found["training"].on_variant) == ((), ("b",))
 
 
-def test_a_curve_of_single_points_is_left_out_and_episodes_are_the_axis_of_their_budget(lake):
-    results, place = lake
-    first = results.curves[results.curves["step"] == 10]
-    found = learning_curves(replace(results, curves=first), place)
-    assert not any(of_agents for each in found.values() for of_agents in each.by_axis.values())
-    for budget, expected in (({"n_episodes": 9}, "episode"), ({"n_timesteps": 9}, "step")):
-        spec = TrainSpec(algo="qlearning", env_id="FrozenLake-v1", **budget)
-        runs = tuple(PlannedRun("b", name, 0, spec, Path()) for name in ("lake", "other"))
-        curves = learning_curves(replace(results, planned=runs), place)
-        assert curves["evaluation"].budget == expected
-
-
 def test_runs_with_a_figure_by_seed(lake):
     found = [
         (r.agent, r.seeds.tolist(), r.values.tolist(), r.mean.point) for r in run_series(*lake)
@@ -132,13 +117,6 @@ def test_a_sweep_goes_in_the_order_of_its_values():
     assert curve.y.tolist() == [1, 5, 9]
     assert curve.low == pytest.approx([0.9, 4.9, 8.9])
     assert curve.high == pytest.approx([1.2, 5.2, 9.2])
-
-
-def test_what_makes_no_sweep():
-    """Two values make no line, and a third that is no number or without a run makes none of it."""
-    place = made_up.environment([made_up.agent(label, 1.0) for label in "abc"])
-    for third in ([], [swept("c", 3, name="gamma")], [swept("c", "lin_0.5")], [swept("d", 3)]):
-        assert sweeps([swept("a", 1), swept("b", 2), *third], place) == {}
 
 
 def test_two_parameters_make_a_grid():

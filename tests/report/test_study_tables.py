@@ -1,20 +1,22 @@
-"""A study as tables: in Markdown and in LaTeX; and the ranking on the page.
+"""A study as tables: in Markdown, in LaTeX, on the page, and in terminals of any width."""
 
-What the terminal prints is recorded in ``tests/golden``.
-"""
-
+import io
 import math
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from rl_yardstick.commands.terminal import TextConsole
+from rl_yardstick.experiments.off_policy import Comparison, Judged, PolicyTerms
 from rl_yardstick.report import documents
 from rl_yardstick.report.documents import MARKUPS, headline, ranking, table_as
 from rl_yardstick.report.page import result_sections
 from rl_yardstick.report.page.frame import Report
 from rl_yardstick.report.ranking import COLUMNS, Row
 from rl_yardstick.report.series import StudySeries
+from rl_yardstick.report.terminal import print_analysis, print_comparison
 from rl_yardstick.report.words import conclusion
 from rl_yardstick.verdicts import Best, Estimate, ThresholdSummary
 from tests.report import made_up
@@ -61,12 +63,6 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
         ("first", "lake"): 40.4,
         ("same", "lake"): 0.1249,
     }
-
-
-def test_nobody_leads_where_none_has_learnt():
-    for changes, n_bold in (({}, 3), ({"baseline": 95.0}, 0)):
-        rows = headline(of_lake(**changes)).rows
-        assert sum(cell.is_bold for row in rows for cell in row.cells) == n_bold
 
 
 def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_footnote():
@@ -130,9 +126,8 @@ def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
 
 def tables_of(agents, **changes):
     """What the page shows of agents on an environment."""
-    found = made_up.analysis(
-        [made_up.environment(agents, **changes)], [agent.agent for agent in agents]
-    )
+    place = made_up.environment(agents, **changes)
+    found = made_up.analysis([place], [agent.agent for agent in agents])
     (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
     return table
 
@@ -190,7 +185,7 @@ def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
     (_, slow), (_, absent) = table["rows"]
     stays = slow[titles.index("Stays from")]
     assert (stays.text, stays.value, stays.note) == ("never", math.inf, "25% of runs")
-    for title in ("Mean", "Score", "Gap", "Success", "Stays from", "CPU time"):
+    for title in ("Mean", "Score", "Gap", "Stays from", "CPU time"):
         cell = absent[titles.index(title)]
         assert (cell.text, cell.value, cell.note, cell.aside) == ("-", None, "", ""), title
 
@@ -213,3 +208,59 @@ def test_returns_beside_that_of_the_greedy_policy_stand_below_the_ranking():
         ["43 42.9 to 43.2", "unknown", "-"],
     ]  # fmt: skip
     assert tables_of(agents[1:])["others"] is None
+
+
+# --- in a terminal no digit is cut -----------------------------------------------------------------
+
+LONG_NAMES = ["double_expected_sarsa_with_a_long_name", "an agent of many short words here", "x"]
+LARGE = -12_345_678.0
+
+
+def agents_table(console):
+    far = [made_up.estimate(LARGE, LARGE - 7654, LARGE + 1234) for _ in range(4)]
+    figures = dict(zip(("metric", "judged", "final", "area"), far, strict=True))
+    figures["metric"] = replace(made_up.agent("x", 1.0).metric, mean=far[0], median=far[1])
+    agents = [made_up.agent(name, 1000.0 * n, **figures) for n, name in enumerate(LONG_NAMES)]
+    place = made_up.environment(agents, optimum=123_456.0)
+    print_analysis(console, made_up.analysis([place], LONG_NAMES))
+
+
+def logged_table(console):
+    terms = np.array([12_345.0, 23_456.0])
+    rows = [
+        Judged(f"logs/{name}", PolicyTerms(*[k * terms] * 3, 1669.0 * k, terms, terms), k > 1)
+        for k, name in enumerate(LONG_NAMES, start=1)
+    ]
+
+    class Log:
+        source, n_arms = "log.csv", 2
+        __len__ = lambda _: 5000  # noqa: E731
+
+    print_comparison(console, Comparison(Log(), tuple(rows), ()))
+
+
+def printed(table, width, is_terminal):
+    file = io.StringIO()
+    table(TextConsole(file=file, width=width, force_terminal=is_terminal, color_system=None))
+    return file.getvalue()
+
+
+def numbers(text):
+    return re.findall(r"[-+]?\d[\d,.]*", text.replace("\N{MINUS SIGN}", "-"))
+
+
+@pytest.mark.parametrize("table", [agents_table, logged_table])
+def test_no_digit_is_cut_and_no_column_missed_at_any_width(table):
+    whole = printed(table, 400, False)
+    headings = {part.strip() for part in re.split("[┃│\n]", whole) if part.strip()}
+    headings = headings & {"IPS", "self-normalised", "effective", "IQM", "reward", "mean"}
+    for width in (40, 60, 72, 80):
+        for is_terminal in (False, True):
+            shown = printed(table, width, is_terminal)
+            assert set(numbers(shown)) <= set(numbers(whole)), (width, is_terminal)
+            assert all(re.search(rf"\b{each}\b", shown) for each in headings)
+            rows = [line for line in shown.splitlines() if line[:1] in "┃│┏└"]
+            if width >= 60:
+                assert rows
+                assert max(map(len, rows)) <= width
+            assert "…" not in shown
