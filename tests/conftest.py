@@ -8,7 +8,7 @@ import signal
 import sys
 import tempfile
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -133,33 +133,35 @@ def own_folder(monkeypatch, tmp_path):
     (tmp_path / "own").mkdir()
     folder = (tmp_path / "own").resolve()
     monkeypatch.chdir(folder)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), str(Path(__file__).parents[1])]))
     monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
     tables = [(table, dict(table)) for table in (ALGORITHMS, gym.registry, sys.modules)]
     yield folder
     for table, before in tables:
         for name in table.keys() - before.keys():
-            if table is not sys.modules or _is_of(table[name], tmp_path):
+            is_own = str(tmp_path) in str(getattr(table[name], "__file__", "") or "")
+            if table is not sys.modules or is_own:
                 del table[name]
 
 
-def _is_of(module, folder):
-    return str(folder) in str(getattr(module, "__file__", "") or "")
-
-
 @pytest.fixture
-def typed(monkeypatch, capsys):
-    """Run a command line in this process: exit code, output, errors."""
-    from rl_yardstick import commands
+def typed(capfd):
+    """Run a command line in this process: exit code, output, errors, its children's included."""
+    from rl_yardstick.commands import main, run_command
 
     def run(*words):
-        name = str(words[0]).removesuffix(".py")
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *(str(word) for word in words[1:])])
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
-        code = commands._exit_code(name)
+        name = Path(words[0]).name
+        command = main if name == "yardstick" else partial(run_command, name.removesuffix(".py"))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "path", [*sys.path])
+            patch.setattr(sys, "argv", [name, *map(str, words[1:])])
+            with pytest.raises(SystemExit) as stop:
+                command()
         for number, handler in handlers.items():  # the process would end with its command
             signal.signal(number, handler)
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
+        captured = capfd.readouterr()
+        return stop.value.code, captured.out, captured.err
 
     return run
 

@@ -124,8 +124,6 @@ def test_the_example_of_a_study_is_one_and_every_key_is_documented(tmp_path):
     assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(_File.model_fields)
 
 
-# --- what the commands reach ----------------------------------------------------------------------
-
 # Those that take little processor time and always succeed; of each algorithm the first one.
 SECONDS = 0.25
 ROWS = reached()

@@ -39,9 +39,6 @@ SHORT = ["--algo", "qlearning", "-n", "60"]
 PAIR = [*LAKE, "--algos", "qlearning", "-n", "60"]
 
 
-# --- a flag reaches the field that has its name -----------------------------------------------
-
-
 def test_flags_of_train_reach_the_specification():
     given = {"seed": 7, "eval_freq": -1, "eval_episodes": 3, "n_eval_envs": 2, "save_freq": 9}
     given |= {"vec_env": "subproc", "device": "cpu", "log_interval": 4}
@@ -106,9 +103,6 @@ def test_the_file_of_a_map_is_in_the_titles_and_not_in_the_folders(tmp_path):
     assert plan(compared(str(file)), tmp_path)[0].environment == "own"
 
 
-# --- what values mean, and what is refused in one line -----------------------------------------
-
-
 MEANINGS = [
     (TRAIN, "-n", {"1e5": 100_000, "100_000": 100_000, "-1": -1}, "0 -5 1.5 nan inf text 1e13"),
     (TRAIN, "--seed", {"-1": -1, "0": 0, "4294967295": 2**32 - 1}, "-7 4294967296 1.5"),
@@ -130,9 +124,6 @@ def test_what_a_value_means(module, flag, taken, refused):
     for text in refused.split():
         with pytest.raises(UserError, match=re.escape(f"not {text!r}")):
             parser.parse_args([f"{flag}={text}"])
-
-
-# --- which engine: what --engine makes of trainings, studies and searches ------------------------
 
 
 ENGINES = [
@@ -188,9 +179,6 @@ def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(tmp_path):
         assert tuning.identity(entry, {})["search_engine"] == search  # another makes another search
 
 
-# --- a flag that there is not is answered with what was meant -----------------------------------
-
-
 def answer(module, words):
     with pytest.raises(UserError) as mistake:
         module.build_parser().parse_args(words.split(" "))
@@ -214,7 +202,7 @@ def test_what_was_meant():
         assert f"unknown argument {flag} 1: {said}" in answer(TRAIN, f"{flag} 1")
 
 
-# --- what may be typed beside --resume: nothing that the run has already, not even as it has it --
+# What may be typed beside --resume: nothing that the run has already, not even as it has it.
 
 ALLOWED = {"--gym-packages": "math", "--log-folder": "logs", "--verbose": "0", "--progress": None}
 OTHERS = {"--engine": "auto", "--hyperparams": "gamma:0.9", "--eval-freq": "5"}

@@ -26,9 +26,6 @@ LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 TRAIN = str(Path(__file__).parents[2] / "train.py")
 
 
-# --- the end of a run in words --------------------------------------------------------------------
-
-
 def sampled(*returns, **fields):
     return Evaluation(np.array(returns), np.ones(len(returns)), None, **fields)
 
@@ -52,22 +49,10 @@ ENDS = {
         "score 0.99   return 0.7402 of 0.7442 (gap 0.0040)   success 74 %",
         "score 0   return 0.0495   best random or constant policy",
     ),
-    "optimal": (
-        exact(79 - 1e-14, 1.0, 79.0, -1000.0),
-        None,
-        "score 1   return 79 of 79   success 100 %",
-        WAREHOUSE,
-    ),
     "nearly optimal": (
         exact(79 - 1e-9, 1 - 1e-4, 79.0, -1000.0),
         None,
         "score 0.99   return 79 of 79 (gap 1e-09)   success 99.9 %",
-        WAREHOUSE,
-    ),
-    "episodes do not end": (
-        exact(-1000.0, 0.0, 79.0, -1000.0),
-        None,
-        "score 0.00   return -1000 of 79 (gap 1079)   success 0 %",
         WAREHOUSE,
     ),
     "sampled": (
@@ -179,12 +164,9 @@ def test_the_other_agent_fits(algo, env_id, other):
     assert other_agent(spec_of(algo, env_id)) == other
 
 
-# --- whole commands -------------------------------------------------------------------------------
-
-
 def test_the_head_tells_what_auto_stands_for_and_what_a_discount_costs(type_command, tmp_path):
     slipping = ["--algo", "qlearning", "--env", "Warehouse-v0", "--env-kwargs", "slip:0.2"]
-    code, out, _ = type_command("train.py", *slipping, "-n", "500", "--seed", "0")
+    code, out, _ = type_command("train.py", *slipping, "-n", "500")
     assert code == 0
     assert "gamma=0.9995 (auto: 1 - 1/(2 x time limit of 1,000))" in " ".join(out.split())
     assert "exact planning" not in out
@@ -193,10 +175,6 @@ def test_the_head_tells_what_auto_stands_for_and_what_a_discount_costs(type_comm
     assert (spec["algorithm"]["gamma"], *spec["origins"]) == (0.9995, "gamma", "learning_rate")
     assert yaml.safe_load((run / "Warehouse-v0" / "config.yml").read_text())["gamma"] == 0.9995
     assert (run / "Warehouse-v0" / "command.txt").read_text().startswith("python train.py --algo")
-    words = ("train.py", *slipping, "-n", "500", "--seed", "0", "-params", "gamma:0.99")
-    code, out, _ = type_command(*words)
-    assert code == 0
-    assert "at gamma 0.99 even exact planning scores 0.00 here; 0.9995: 1.00" in out
 
 
 @pytest.mark.usefixtures("pictures")
@@ -231,19 +209,16 @@ def test_scripts_that_a_queue_starts_again(type_command, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_command_and_tells_how_to_resume(tmp_path, number):
+def test_a_signal_ends_a_command_and_tells_how_to_resume(type_command, tmp_path, number):
     words = [sys.executable, TRAIN, "--env", "CartPole-v1", "--algo", "ppo", "-n", "10000000"]
     process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     state = tmp_path / "logs/ppo/CartPole-v1_1/state.bin"
     begun = time.monotonic()
     while not state.exists() and time.monotonic() - begun < 200:
         time.sleep(0.1)
-    second = subprocess.run(
-        [sys.executable, TRAIN, "--resume", str(state.parent)],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert (second.returncode, second.stderr.count("\n")) == (2, 1)
-    assert f"is in use by another command, process {process.pid}" in second.stderr
+    code, _, err = type_command("train.py", "--resume", state.parent)
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"is in use by another command, process {process.pid}" in err
     process.send_signal(number)
     out, _ = process.communicate(timeout=100)
     assert process.returncode == 128 + number

@@ -38,8 +38,6 @@ def pulls_in(folder):
         return dict(file)
 
 
-# --- Figures by pull, worked on paper where something is missing, else the plain way.
-
 # Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
 ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
 REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
@@ -90,8 +88,6 @@ def test_statistics_are_read_as_they_were_written(tmp_path):
         np.testing.assert_array_equal(getattr(read, name), value, strict=True)
     assert read.posteriors.tolist() == given["posteriors"][0].tolist()  # of the first run alone
 
-
-# --- Batches where they may be, equal to their runs to the last bit.
 
 SEGMENTS = EnvironmentSpec("segments", "SegmentBandit-v0", {"n_timesteps": 200})
 LONG = EnvironmentSpec(
@@ -169,9 +165,6 @@ def test_runs_beside_batches(tmp_path, do_study):
         in_time = regrets.T.ravel()[:100]
         assert np.array_equal(read_run(run.path, 100)["regrets"], in_time)
         assert run_regret(run) == pytest.approx(regret) == pytest.approx(in_time.sum())
-
-
-# --- The studies as they are shipped, with fewer runs.
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,6 @@ from rl_yardstick.verdicts import Estimate
 
 ESTIMATORS = ("ips", "snips", "doubly_robust")
 
-# --- By hand.
 
 ARMS = np.array([0, 0, 1, 1])
 REWARDS = np.array([1.0, 0, 1, 3])
@@ -118,8 +117,6 @@ def test_a_ridge_regression_for_each_arm():
     assert found[:, 2] == pytest.approx(np.full(4, rewards.mean()))  # without a pull
 
 
-# --- Against the truth: the segments of SegmentBandit.
-
 # The best treatment for each segment, at .159 clicks a user.
 BY_SEGMENT = np.array([[0.0, 1, 0], [1, 0, 0]])
 TRUTH = 0.3 * 0.25 + 0.7 * 0.12
@@ -168,8 +165,6 @@ def test_replay_of_a_uniform_log_is_the_self_normalised_estimate(tmp_path):
     assert effective_sample_size(weights) == pytest.approx(info["matched_pulls"])
 
 
-# --- Where a log stops being one, or holds too little of what a policy does.
-
 TOO_LITTLE = "the log holds too little of what the policy does: its weights are 0.979"
 TOO_SMALL = "the propensities are too small: the weights are 1.29 on average"
 # What stands where in a log of both arms in turn, and what is said of it.
@@ -194,8 +189,6 @@ def test_what_a_policy_is_judged_on(name, place, value, refusal):
     with pytest.raises(ValueError, match=refusal) if refusal else nullcontext():
         evaluate_policy(**given, predicted=model)
 
-
-# --- Agents on logs: which can be judged, what they stand beside, and what is said of them.
 
 HEAD = "segment,arm,reward,propensity\n"
 NUMBERS = HEAD + "".join(f"{i % 2},{i % 3 % 2},{i % 5},0.5\n" for i in range(60))

@@ -83,9 +83,6 @@ def read_one(root, evaluations, episodes):
     return read_results(study, [planned], root)
 
 
-# --- Rows and curves.
-
-
 def test_a_row_for_each_run(tmp_path):
     episodes = [(10, 1.0)] * 5 + [(25, 3.0)] * 2
     results = read_one(tmp_path, [(20, 10.0), (60, 96.0), (100, 90.0)], episodes)
@@ -223,9 +220,6 @@ def test_what_counts_as_solved(env_id, stated, ends, threshold):
     assert found is threshold is None or found == pytest.approx(threshold)
 
 
-# --- Judgements and sentences.
-
-
 def test_ranks_estimates_and_pairs(tmp_path):
     finals = {"qlearning": [10, 11, 12, 13, 14], "sarsa": [90, 91, 92, 91, 91]}
     results = results_of(study_of(n_seeds=5), tmp_path, finals)
@@ -274,9 +268,6 @@ def test_what_is_within_reach_goes_by_the_lower_end_of_a_bracket(tmp_path):
     assert environment.agents[1].score.point == pytest.approx(380 / 500)
     assert environment.impossible == ("sarsa",)
     assert (environment.optimum_is_proven, environment.optima) == (True, {})
-
-
-# --- Files, also of studies that went wrong.
 
 
 SOME = [(50, 1.0), (100, 3.0)]

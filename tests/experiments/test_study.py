@@ -138,9 +138,6 @@ def test_an_agent_has_a_file_of_settings_beside_the_study(read, tmp_path):
     ]
 
 
-# --- Sweeps.
-
-
 def test_sweeps_multiply_and_are_counted_before_they_are_made(read):
     study = read(
         TAXI + "sweep: {gamma: [0.9, 0.99], learning_rate: [0.1, 0.5]}\n"
@@ -154,9 +151,6 @@ def test_sweeps_multiply_and_are_counted_before_they_are_made(read):
     sweep = ", ".join(f"{name}: {list(range(100))}" for name in "abcdef")
     with pytest.raises(UserError, match=r":4: 1,000,000,000,001 agents up to here; .* 10,000 at"):
         read(f"{TAXI}agents:\n  sarsa:\n  qlearning:\n    sweep: {{{sweep}}}\n")
-
-
-# --- Names and files.
 
 
 def test_a_shipped_study_is_found_by_its_name(tmp_path, monkeypatch):
@@ -190,9 +184,6 @@ def test_a_record_that_is_none(content, tmp_path):
     (tmp_path / "study.json").write_text(content)
     with pytest.raises(UserError, match=r"study\.json"):
         StudyRecord.read(tmp_path)
-
-
-# === from a study to its runs =====================================================================
 
 
 NOWHERE = Path("nowhere")
@@ -280,9 +271,6 @@ def test_what_cannot_be_trained_is_refused_beforehand(tmp_path, algo, settings, 
     assert list(tmp_path.iterdir()) == []
 
 
-# --- Which run it is that a folder holds.
-
-
 def record(planned, state=FINISHED, **fields):
     """What a run that has come to its end leaves."""
     planned.path.mkdir(parents=True, exist_ok=True)
@@ -338,8 +326,6 @@ def test_checkpoints_are_asked_of_the_first_seed_alone(tmp_path):
     assert only(PLAIN, tmp_path).is_finished
     assert not only(replace(PLAIN, render_every=6), tmp_path).is_finished
 
-
-# --- Which seeds of a study its settings were tuned on, and how that is said.
 
 DQN, PPO, RANDOM = (AgentSpec(name, name) for name in ("dqn", "ppo", "random"))
 

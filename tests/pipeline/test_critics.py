@@ -40,9 +40,6 @@ def rows_of(run):
         return [{k: float(v or "nan") for k, v in row.items()} for row in csv.DictReader(file)]
 
 
-# --- values of a table ----------------------------------------------------------------------------
-
-
 def chain_world():
     """0 goes on to 1 for a reward of 1, 1 to the end for 2; action 1 stays, for nothing."""
     following = np.array([[[1], [0]], [[1], [1]]])
@@ -103,9 +100,6 @@ def test_which_policy_an_agent_s_values_are_of():
         assert recorder.explores == (algo in follows), algo
         recorder.model = agent
         assert np.isfinite(recorder.figures()["v_error"]), algo
-
-
-# --- advantages and gradients of rollouts ---------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -257,9 +251,6 @@ def test_a_state_without_advantages_counts_by_what_was_estimated_there(corridor_
         found.append(recorder.gradient_figures(true, states, actions, [batch]))
     assert found[0] == pytest.approx(found[1], rel=1e-6)
     assert found[0]["gradient_cosine"] < 0.99
-
-
-# --- a training -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

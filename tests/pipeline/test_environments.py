@@ -49,9 +49,6 @@ def time_limit(env):
     return next((each._max_episode_steps for each in limits), None)
 
 
-# --- arguments -----------------------------------------------------------------------------------
-
-
 ENTRY = {
     "env_kwargs": {"step_reward": -2, "goal_reward": 50},
     "train_env_kwargs": {"random_start": True, "max_episode_steps": 30, "goal_reward": 60},
@@ -111,9 +108,6 @@ def test_what_training_changes(entry, changes):
     assert training_changes(world("Warehouse-v0", entry)) == changes
 
 
-# --- time limits ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("env_id", "entry", "training", "evaluation"),
     [
@@ -131,8 +125,6 @@ def test_evaluation_always_has_a_time_limit(env_id, entry, training, evaluation)
     made = make_single_env(spec), make_evaluation_env(spec, 1).envs[0]
     assert [time_limit(env) for env in made] == [evaluation] * 2
 
-
-# --- wrappers ------------------------------------------------------------------------------------
 
 WRAPPED = {
     "env_wrapper": [
@@ -159,9 +151,6 @@ def test_wrappers_stand_in_their_order():
         env.reset()
         _, rewards, dones, infos = env.step([3])
         assert (rewards[0], dones[0], infos[0]["episode"]["r"]) == (reward, True, 100.0)
-
-
-# --- vectorised environments ---------------------------------------------------------------------
 
 
 def test_normalisation_learns_in_training_alone_and_rewards_are_evaluated_as_they_are():
@@ -198,9 +187,6 @@ def test_a_mistaken_argument_is_told_in_a_line(env_id, kwargs, complaint):
     assert str(refused.value).endswith(complaint)
 
 
-# --- files that arguments name -------------------------------------------------------------------
-
-
 def test_a_maps_rows_take_the_place_of_its_path_and_a_log_is_found_from_other_folders(
     tmp_path, monkeypatch
 ):
@@ -232,8 +218,6 @@ def test_a_maps_name_is_that_of_the_file_that_is_evaluated_on():
         assert map_name("Warehouse-v0", kwargs) == expected, kwargs
     assert map_name("CartPole-v1", {"env_kwargs": path}) == ""
 
-
-# --- names in files, and modules that the user typed ----------------------------------------------
 
 KINDS = (nn.Module, optim.Optimizer, BaseBuffer)
 CALLBACKS = "stable_baselines3.common.callbacks"
@@ -320,8 +304,6 @@ def test_arguments_make_an_agent():
     entry = {"exploration": "gaussian_noise", "noise_std": 0.25}
     assert make_agent(spec_of("qlearning", entry=entry), None).noise_std == 0.25
 
-
-# --- modules of the user --------------------------------------------------------------------------
 
 MODULE = """
 import gymnasium as gym

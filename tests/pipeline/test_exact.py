@@ -115,9 +115,6 @@ def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
     assert (policies.best_actions(Contrary(env="FrozenLake-v1"), states) == 3).all()
 
 
-# --- returns beside that of the greedy policy ----------------------------------------------------
-
-
 DRY = {"env_kwargs": {"is_slippery": False}}
 
 
@@ -152,9 +149,6 @@ def test_bandits_draw_their_arms_by_their_own_rule():
         assert found.acts_by == words
         expected = 100 * np.dot(chances, PROBS["probabilities"])
         assert found.stochastic_return == pytest.approx(expected)
-
-
-# --- the yardstick -------------------------------------------------------------------------------
 
 
 def test_the_best_policy_scores_1_and_the_baseline_one_0():
@@ -232,7 +226,6 @@ def test_what_is_not_known_is_not_guessed():
         policy_matrix(Lookup(np.zeros(16, int)), evaluator.observations, False)
 
 
-# --- advice --------------------------------------------------------------------------------------
 UP, DOWN, LEFT, RIGHT = range(4)  # of the warehouse
 PAIRS = 61 * 4  # states of the warehouse that can be reached, times actions
 
@@ -290,8 +283,6 @@ def test_by_two_signals(start_value, n_steps, try_first):
     assert judged("Warehouse-v0", table, n_steps, gamma=0.99).try_first == try_first
 
 
-# --- what agents make of their actions -----------------------------------------------------------
-
 TINY = {"policy_kwargs": {"net_arch": [8]}}
 
 
@@ -348,9 +339,6 @@ def yardstick_of(algo, env_id, entry=None):
     return exact_evaluator(spec_for(algo, env_id, entry)).yardstick
 
 
-# --- the scale -----------------------------------------------------------------------------------
-
-
 def test_agents_without_memory_are_measured_by_the_best_of_their_kind():
     yardstick = yardstick_of("qlearning", CORRIDOR)
     assert yardstick.optimum == pytest.approx(BEST_OF_CORRIDOR)
@@ -405,9 +393,6 @@ def test_no_discounted_optimum_is_told_where_observations_hide_the_state():
     found = evaluator.other_returns(agent)
     assert found.discounted_return == pytest.approx(-(1 - 0.99**10) / 0.01)
     assert found.discounted_optimum is None
-
-
-# --- histories -----------------------------------------------------------------------------------
 
 
 class Counting:

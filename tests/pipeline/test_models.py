@@ -52,9 +52,6 @@ def seen(path):
     return round(read(path).obs_rms.count)
 
 
-# --- which model ----------------------------------------------------------------------------------
-
-
 def test_which_model_of_which_run(tmp_path):
     runs = [train_to(tmp_path, "a2c", SMALL_A2C, 60, save_freq=20, seed=i) for i in range(2)]
     found = {"algo": "a2c", "env_id": CART, "log_folder": tmp_path}
@@ -80,9 +77,6 @@ def test_which_model_of_which_run(tmp_path):
     (runs[0].path / "run.json").write_text("{}")
     with pytest.raises(UserError, match=r"no run folder of this version: run\.json has no spec"):
         find_model(Wanted(Path(runs[0].path)))
-
-
-# --- statistics of normalisation ------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +110,6 @@ def test_statistics_go_on_unless_the_new_entry_has_none(normalised, tmp_path):
     assert run.spec().normalize["clip_obs"] == 3.0
 
 
-# --- replay buffers -------------------------------------------------------------------------------
-
-
 def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tmp_path):
     fields = {"save_replay_buffer": True, "eval_freq": -1}
     first = train_to(tmp_path / "first", "dqn", SMALL_DQN, save_freq=80, **fields)
@@ -147,7 +138,6 @@ def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tm
     env.close()
 
 
-# --- agents of others: rl_zoo3's layout and a model hub's, made with the library alone -----------
 CONFIG = OrderedDict(
     frame_stack=2,
     learning_rate="lin_0.1",

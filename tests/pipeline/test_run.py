@@ -41,9 +41,6 @@ def own_place(tmp_path, monkeypatch):
     monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 200)
 
 
-# --- names and locks ------------------------------------------------------------------------------
-
-
 def test_numbers_are_given_once_and_the_newest_is_last():
     spec = spec_of("qlearning")
     paths = [Run.claim(Path("logs"), spec).path for _ in range(11)]
@@ -97,9 +94,6 @@ def test_the_folder_has_the_layout_of_rl_zoo3():
     assert np.load(run.path / "evaluations.npz")["timesteps"].tolist() == [100, 200, 300]
 
 
-# --- stops ----------------------------------------------------------------------------------------
-
-
 def test_the_first_signal_is_a_number_and_the_second_ends_at_once():
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     stop = Stop().listen()
@@ -112,9 +106,6 @@ def test_the_first_signal_is_a_number_and_the_second_ends_at_once():
     for number, handler in before.items():
         signal.signal(number, handler)
     assert stopped.value.number == signal.SIGTERM
-
-
-# --- failures of a training -----------------------------------------------------------------------
 
 
 def test_an_error_is_recorded_and_what_was_written_stays(monkeypatch):
@@ -136,9 +127,6 @@ def test_an_error_is_recorded_and_what_was_written_stays(monkeypatch):
     assert record["state"] == "failed"
     assert "No space left on device" in record["reason"]
     assert (run.path / "best_model.zip").exists()
-
-
-# --- files ----------------------------------------------------------------------------------------
 
 
 def test_a_file_has_its_name_when_it_is_whole(tmp_path, small_disk):
@@ -194,8 +182,6 @@ def test_json_has_no_nan_and_keeps_infinity(tmp_path):
     assert json_text(math.inf) == "1e999"
 
 
-# --- trainings ------------------------------------------------------------------------------------
-
 SMALL_PPO = {"n_steps": 32, "batch_size": 16, "n_epochs": 1, "n_envs": 1}
 
 
@@ -215,9 +201,6 @@ def test_when_evaluations_come(entry, fields, steps):
     if steps is not None:
         assert np.load(path)["timesteps"].tolist() == steps
         assert outcome.best_timesteps in steps
-
-
-# --- numbers that are not finite, and errors ------------------------------------------------------
 
 
 class Sick(gym.Env):
@@ -293,9 +276,6 @@ def test_what_only_the_constructor_knows_is_one_line_and_leaves_no_folder(algo, 
         trained(algo, CART, entry, n_timesteps=64)
     assert said in str(caught.value)
     assert not Path("logs").exists()
-
-
-# --- what is printed and drawn --------------------------------------------------------------------
 
 
 def test_remarks_and_pictures(monkeypatch):

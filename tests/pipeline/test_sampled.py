@@ -47,9 +47,6 @@ def episodes(*returns, length=10, yardstick=None, successes=None):
     return Evaluation(np.array(returns, float), lengths, successes).measured_by(yardstick)
 
 
-# --- seeds ---------------------------------------------------------------------------------------
-
-
 def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile():
     n_envs, model = 4, agent_of("qlearning", LAKE).learn(2000)
     env = make_vec_env(LAKE, n_envs)
@@ -87,9 +84,6 @@ def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_strea
     assert not tuned & judged
 
 
-# --- what is played ------------------------------------------------------------------------------
-
-
 def test_successes_are_counted_where_the_environment_tells_them():
     env_kwargs = {"slip": 0.3, "shelf_reward": -1, "max_episode_steps": 40}
     model = agent_of("qlearning", "Warehouse-v0", learning_rate=0.3).learn(60_000)
@@ -123,9 +117,6 @@ def test_training_is_the_same_with_and_without_evaluations(tmp_path):
     )
     assert (found.obs_rms.mean == other.obs_rms.mean).all()
     assert found.ret_rms.var == other.ret_rms.var
-
-
-# --- how much of it ------------------------------------------------------------------------------
 
 
 def test_when_a_mean_is_sure():
@@ -217,8 +208,6 @@ def test_a_run_says_what_its_evaluations_took(tmp_path):
     assert outcome.evaluating.cpu_seconds > 0
 
 
-# --- measured by a bracket -----------------------------------------------------------------------
-
 POLE = Yardstick(optimum=500.0, baseline=20.0, at_least=480.0)
 
 
@@ -255,7 +244,6 @@ def test_more_than_any_policy_can_reach_is_said_aloud_and_not_clipped(returns, y
         assert found.summary()["score"] == pytest.approx(481 / 480)
 
 
-# --- in compiled code: the episodes that evaluation in Python plays ------------------------------
 WIDTHS = {"low": [-2.4, -3.0, -0.21, -3.0], "high": [2.4, 3.0, 0.21, 3.0]}
 IN_BINS = partial(DiscretizeObservation, bins=[1, 6, 12, 6], **WIDTHS)
 SMALL = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [16]}}

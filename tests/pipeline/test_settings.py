@@ -46,8 +46,6 @@ def spec_of(algo="qlearning", env_id="FrozenLake-v1", **entry):
     return read_spec(algo, env_id, {"n_timesteps": 10, **entry})
 
 
-# --- texts ----------------------------------------------------------------------------------------
-
 LITERALS = [
     ("0.5", 0.5),
     ("1e-4", 1e-4),
@@ -95,8 +93,6 @@ def test_junk_is_read_or_refused_in_one_line(text):
             (line,) = str(error).splitlines()
             assert len(line) < 600
 
-
-# --- mistakes: an entry, and a part of the line -------------------------------------------------
 
 MISTAKES = [
     ("ppo", {"gama": 0.9}, "ppo has no hyperparameter 'gama': did you mean 'gamma'"),
@@ -172,9 +168,6 @@ def test_the_table_of_arguments_is_up_to_date():
     assert set(table) == installed
     for algo in installed:
         assert table[algo] == read_signature(algo), algo
-
-
-# --- entries --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", ZOO_FILES, ids=lambda path: path.stem)
@@ -302,8 +295,6 @@ def test_what_is_asked_for_wins_over_an_entrys_variant_for_training():
         assert found == {**entry, "train_env_kwargs": kept}
         assert bool(told) == is_told
 
-
-# --- what ``auto`` stands for, and what a discount costs ------------------------------------------
 
 CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": "auto"}}
 SCALE = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": "auto"}}

@@ -152,9 +152,6 @@ def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, mo
     assert not (tmp_path / "logs").exists()
 
 
-# --- progress, in terminals and elsewhere ---------------------------------------------------------
-
-
 def text_shown(n_steps, *, live):
     """What is written while an agent learns."""
     file = io.StringIO()
@@ -188,8 +185,6 @@ def map_of(actions, **env_kwargs):
     return value_map(exact_evaluator(spec), agent)
 
 
-# --- one map -------------------------------------------------------------------------------------
-
 # Right, left again; down onto the goal; up against the outer wall from below the start.
 THERE_AND_BACK = [RIGHT, LEFT, DOWN, LEFT, UP, UP]
 
@@ -218,9 +213,6 @@ def test_an_action_among_several_best_ones_does_not_differ():
     assert found.optimal_actions[6].tolist() == [True, False, False, True]
 
 
-# --- over the training ---------------------------------------------------------------------------
-
-
 def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(tmp_path):
     entry = {"learning_rate": 0.5, "env_kwargs": {"slip": 0.2}}
     kept = {"n_timesteps": 450, "eval_freq": 100, "save_freq": 100, "pictures": True}
@@ -242,9 +234,6 @@ def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(tmp_path):
         at_start = maps["values"][:-1] @ evaluator.model.initial
         np.testing.assert_allclose(at_start, evaluations["results"][:, 0], rtol=1e-12)
     assert (run.path / "value_map.png").read_bytes().startswith(b"\x89PNG")
-
-
-# --- the picture of a map ------------------------------------------------------------------------
 
 
 def test_numbers_on_a_map_are_returns_with_three_digits_or_more():
@@ -274,9 +263,6 @@ def test_frames_and_arrows_are_what_the_map_says():
     ]
     right, left = [(0, 0, 1, 0, 1.0), (0, 1, -1, 0, 0.45)], [(1, 0, -1, 0, 1.0), (2, 0, 0, 1, 0.45)]
     assert sorted(arrows) == right + left
-
-
-# --- the learning curve --------------------------------------------------------------------------
 
 
 def test_the_episodes_of_several_environments_in_the_order_in_which_they_ended(tmp_path):

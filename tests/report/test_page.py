@@ -141,9 +141,6 @@ def test_a_film_is_small_and_made_once(report_study):
         assert picture.n_frames > 1
 
 
-# --- nothing gets in, nothing gets out ------------------------------------------------------------
-
-
 def test_labels_stay_text(page, text):
     assert HOSTILE in page.sections["ranking"]
     scripts = page.all("script")

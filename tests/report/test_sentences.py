@@ -1,4 +1,4 @@
-"""What a study says in words: worked by hand, true of the runs, and one word wherever it is shown."""
+"""What a study says in words: worked by hand, true of the runs, one word wherever it is shown."""
 
 import io
 import json
@@ -140,9 +140,6 @@ def test_once_a_page_it_is_said_what_so_few_runs_cannot_show():
     )
 
 
-# === what is said is true of the runs =============================================================
-
-
 def study_of(runs, root=None):
     """The analysis of made-up final scores, by agent."""
     agents, n_seeds = list(runs), len(next(iter(runs.values())))
@@ -191,8 +188,6 @@ def test_what_is_said_is_true_of_the_runs(runs):
     in_tex = verdicts_as("tex", analysis, "").partition(r"\subsection")[0]
     assert set(re.findall(r"\\texttt\{([A-D])\} & \\textbf", in_tex)) == bold
 
-
-# --- one word about each pair ----------------------------------------------------------------------
 
 SCORES = {
     "best": [1.0] * 12,

@@ -99,9 +99,6 @@ def test_where_an_axis_ceases_to_be_linear(curves, optimum, expected):
     assert linear_up_to([np.array(curve) for curve in curves], optimum) == expected
 
 
-# --- sweeps ---------------------------------------------------------------------------------------
-
-
 def swept(label, value, group="sarsa", name="alpha"):
     return AgentSpec(label, "sarsa", tuned=False, group=group, swept={name: value})
 
@@ -139,8 +136,6 @@ def test_two_parameters_make_a_grid():
     assert with_best_mean(environment, [spec.label for spec in specs]) == ["0.1 b", "0.5 a"]
     assert grids(specs[:2], environment) == {}  # a single row is none
 
-
-# --- bandits --------------------------------------------------------------------------------------
 
 # Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
 ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)

@@ -39,8 +39,6 @@ def of_lake(cpu=(), **changes):
     return made_up.analysis([lake(**changes)], NAMES, cpu=cpu)
 
 
-# --- Markdown and LaTeX ---------------------------------------------------------------------------
-
 LEGEND = (
     "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts as 0. "
     "±: the standard deviation of runs. Bold: the best agents, where another is shown to be "
@@ -119,9 +117,6 @@ def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
     assert needs == r"% Taken in by \input; above it: \usepackage{booktabs,graphicx}"
     assert signs == "% With XeLaTeX or LuaLaTeX, and a font that has these signs: 中"
     assert "%" not in re.sub(r"\\%|\{%$", "", "\n".join(lines), flags=re.MULTILINE)
-
-
-# === the ranking on the page ======================================================================
 
 
 def tables_of(agents, **changes):
@@ -209,8 +204,6 @@ def test_returns_beside_that_of_the_greedy_policy_stand_below_the_ranking():
     ]  # fmt: skip
     assert tables_of(agents[1:])["others"] is None
 
-
-# --- in a terminal no digit is cut -----------------------------------------------------------------
 
 LONG_NAMES = ["double_expected_sarsa_with_a_long_name", "an agent of many short words here", "x"]
 LARGE = -12_345_678.0

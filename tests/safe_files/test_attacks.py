@@ -323,9 +323,6 @@ def test_a_buffer_has_its_rows_in_the_file():
         load_replay_buffer(agent, content)
 
 
-# --- memory in proportion to the file ------------------------------------------------------------
-
-
 def peak_and_answer(load, *args):
     """Bytes that a call takes at its peak, in its own process; and the refusal it ends with."""
     there, here = os.pipe()

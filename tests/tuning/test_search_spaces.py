@@ -76,9 +76,6 @@ def as_run(algo, env_id):
     return shipped_entry(read_spec(algo, env_id, read_entry(algo, env_id)))
 
 
-# --- the files that come with the project ---------------------------------------------------------
-
-
 # Ranges are chosen so that what ships lies inside, but for what no range should hold.
 WIDENED = {("qrdqn", "FrozenLake-v1"): ("policy_kwargs.net_arch",)}  # no hidden layer
 
@@ -147,9 +144,6 @@ def environment_for(algo):
             return env
         env.close()
     raise LookupError(algo)
-
-
-# --- settings and parameters ----------------------------------------------------------------------
 
 
 def test_what_optuna_chooses_becomes_settings(space):
@@ -263,9 +257,6 @@ def test_a_grid_goes_from_end_to_end(space):
     assert grid["log2_batch_size"] == [5, 6, 7]
     assert grid["n_steps"] == [1, 3, 5]
     assert grid["gamma_form"] == ["constant", 1.0]
-
-
-# --- mistakes -------------------------------------------------------------------------------------
 
 
 MISTAKES = [

@@ -174,9 +174,6 @@ def test_a_grid_goes_through_every_point_once(toy):
         toy.search(toy.opened(toy.tuning(sampler="grid", n_trials=4), "too few"))
 
 
-# --- where trials are stored ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("given", [None, "sqlite:///{}/db"])
 def test_a_storage_of_any_kind_keeps_the_search(toy, monkeypatch, given):
     monkeypatch.setattr(searching, "open_storage", REAL_STORAGE)
@@ -201,9 +198,6 @@ def test_a_storage_that_cannot_be_opened_is_one_line_without_its_password(toy, m
         assert "cret" not in str(error.value)
     line = "tune.py --storage postgresql://u:se%40cret@h/db -j 2"
     assert without_secret(line) == line.replace("se%40cret", "***")
-
-
-# --- what a run and a setting are worth, worked out by hand ---------------------------------------
 
 
 VALUES = [
@@ -250,9 +244,6 @@ FIGURES_OF_RUNS = [
 def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value, steps):
     found = outcome(toy, monkeypatch, figure, **row)
     assert (found.figure, found.seconds, found.steps) == (value, 2.0, steps)
-
-
-# === what is ended early ==========================================================================
 
 
 def scored(scores, first=0):
@@ -315,9 +306,6 @@ WORSE = [0.4, 0.39, 0.38, 0.37]
 def test_what_is_hopeless(method, scores, others, options, hopeless):
     found = is_hopeless(scored(scores), [scored(each) for each in others], method, **options)
     assert found is hopeless
-
-
-# === what is tested again =========================================================================
 
 
 def retested(number, held_out, verdict):
