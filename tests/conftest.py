@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import tempfile
+from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
@@ -172,6 +173,36 @@ def type_in_own_folder(own_folder, typed):
     return typed
 
 
+def call(function, *args):
+    return function(*args)
+
+
+class Here:
+    """Stands where a pool of processes does, which would import all libraries once more."""
+
+    def __init__(self, n_workers):
+        self.stop = self.join = lambda: None
+
+    def submit(self, function, timeout, *args):
+        future = Future()
+        try:
+            future.set_result(function(*args))
+        except Exception as error:  # noqa: BLE001  # as a pool does
+            future.set_exception(error)
+        return future
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Studies whose runs are done by this process."""
+    for place in ("experiments.pool", "report.page.learning"):
+        monkeypatch.setattr(f"rl_yardstick.{place}.process_pool", Here)
+    for place in ("experiments.analysis", "report.page.world_sections"):
+        monkeypatch.setattr(
+            f"rl_yardstick.{place}.do_aside", lambda function, *args: function(*args)
+        )
+
+
 @pytest.fixture(scope="session")
 def do_study():
     """Does the runs of a study that are missing, in this process, and reads its results."""
@@ -212,7 +243,7 @@ def report_study(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(films, "MAX_STEPS", 20)  # longer films take ten seconds to draw
         # In this process, where that holds, also if there is one that runs are forked from.
-        patch.setattr(world_sections, "do_aside", lambda function, *args: function(*args))
+        patch.setattr(world_sections, "do_aside", call)
         write_report(Report(study_series(analysis), "python compare.py 'a & b.yml'"), page)
     return SimpleNamespace(
         study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page

@@ -22,9 +22,6 @@ def script(name, folder="scripts"):
     return module
 
 
-headline = script("headline", "../benchmarks")
-
-
 @pytest.fixture(scope="module")
 def fill_pages():
     before = list(sys.path)
@@ -72,15 +69,6 @@ def test_a_line_is_filled_and_others_stay(fill_pages):
     assert all(f"`{name}`" in filled for name in ALGORITHMS)
 
 
-def test_definitions_are_cut_out_whole(fill_pages):
-    text = "A = 1\n\n\n@cached\ndef f():\n    return A\n\n\n"
-    text += "class B:\n    def g(self):\n        return 2\n"
-    definition = script("code_blocks").definition
-    assert definition(text, "A", "") == "A = 1"
-    assert definition(text, "f", "") == "@cached\ndef f():\n    return A"
-    assert definition(text, "B.g", "") == "def g(self):\n    return 2"
-
-
 @pytest.mark.parametrize("page", sorted((DOCS / "algorithms").glob("*.md")), ids=lambda p: p.stem)
 def test_pages_of_algorithms_have_one_form(page):
     text = page.read_text()
@@ -112,17 +100,3 @@ def test_links_that_lead_nowhere_are_found(tmp_path):
         "a.html links to c.html, which is not there",
         "a.html links to #nowhere, where there is no place nowhere",
     ]
-
-
-def test_blocks_of_the_headline_study_are_replaced_and_the_others_stay():
-    page = (
-        "a\n<!-- headline: tuned -->\nold\n<!-- end -->\nb\n"
-        "<!-- headline: what-fell -->\nkept\n<!-- end -->\n"
-    )
-    once = headline.filled(page, {"tuned": "| new \\1 |\n\nlegend\n"})
-    assert once == page.replace("old", "| new \\1 |\n\nlegend")
-    assert headline.filled(once, {"tuned": "old"}) == page
-    assert {
-        path.name: {block[2] for block in headline.BLOCK.finditer(path.read_text(encoding="utf-8"))}
-        for path in headline.PAGES
-    } == {"README.md": {"held-out"}, "library-vs-hand-rolled.md": {"held-out"}}

@@ -26,47 +26,6 @@ COMPARE = Path(__file__).parents[2] / "compare.py"
 LAKE = ["--env", "FrozenLake-v1", "--no-report", "-f", "studies"]
 PAIR = [*LAKE, "--algos", "qlearning", "sarsa", "--n-episodes", "60"]
 
-# An environment of a user's own, slow while there is no file that says it may hurry.
-WALKS = """
-import time
-from pathlib import Path
-
-import gymnasium as gym
-
-MARK = Path(__file__).with_name("mark")
-
-
-class Slow(gym.Env):
-    observation_space = gym.spaces.Discrete(5)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place = 0
-        return 0, {}
-
-    def step(self, action):
-        if not MARK.exists():
-            time.sleep(0.02)
-        self.place = min(max(self.place + 2 * int(action) - 1, 0), 4)
-        return self.place, float(self.place == 4), self.place == 4, False, {}
-
-
-gym.register("Slow-v0", entry_point=Slow, max_episode_steps=20)
-"""
-
-
-@pytest.fixture
-def folder(own_folder):
-    (own_folder / "walks.py").write_text(WALKS)
-    return own_folder
-
-
-@pytest.fixture
-def type_study(folder, typed):
-    """Run ``compare.py`` in a user's own folder."""
-    return lambda *words, program="compare.py": typed(program, *words)
-
 
 def wait_for(condition, seconds=60):
     deadline = time.monotonic() + seconds
@@ -95,55 +54,59 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir() if path.name != ".lock")
 
 
-def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(type_study, folder):
-    study = folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
-    code, out, err = type_study(*PAIR, "--seeds", 1)
+@pytest.mark.usefixtures("in_this_process")
+def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(typed, own_folder):
+    study = own_folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
+    code, out, err = typed("compare.py", *PAIR, "--seeds", 1)
     assert (code, err) == (0, "")
     assert "2 runs, 0 of them there already" in out
     first = records(study)
     assert sorted(first) == [("qlearning", "FrozenLake-v1_1"), ("sarsa", "FrozenLake-v1_1")]
     assert names(study) == FILES
-    assert "4 runs, 2 of them there already" in type_study(*PAIR, "--seeds", 2)[1]
+    assert "4 runs, 2 of them there already" in typed("compare.py", *PAIR, "--seeds", 2)[1]
     assert first.items() <= records(study).items()
     assert sorted(rows(study)["seed"]) == [0, 0, 1, 1]
     words = ["--algo", "sarsa", "--env", "FrozenLake-v1", "--seed", 0, "--n-episodes", 60]
-    assert type_study(*words, program="train.py")[0] == 0
-    places = (folder / "logs", study / "runs")
+    assert typed("train.py", *words)[0] == 0
+    places = (own_folder / "logs", study / "runs")
     paths = (place / "sarsa" / "FrozenLake-v1_1" / "0.monitor.csv" for place in places)
     theirs, ours = (pd.read_csv(path, skiprows=1)[["r", "l"]] for path in paths)
     assert theirs.equals(ours)
     # Finished runs of other settings are replaced only when that is asked for.
     first, other = records(study), [*PAIR, "--seeds", 2, "-params", "gamma:0.9"]
-    code, out, err = type_study(*other)
+    code, out, err = typed("compare.py", *other)
     assert (code, err.count("\n")) == (2, 1)
     assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now): --name" in err
     assert records(study) == first
-    code, out, _ = type_study(*other, "--replace")
+    code, out, _ = typed("compare.py", *other, "--replace")
     assert (code, "4 runs, 0 of them there already" in out) == (0, True)
     assert not set(records(study).values()) & set(first.values())
     place = study / "replaced" / "1"
-    assert f"4 runs are done again: the old folders are in {place.relative_to(folder)} now" in out
+    assert (
+        f"4 runs are done again: the old folders are in {place.relative_to(own_folder)} now" in out
+    )
     place.rename(place.parent / "runs")
     assert records(place.parent) == first
     # What a study's record says is enough to do it elsewhere.
-    (folder / "copy").mkdir()
-    (folder / "copy" / "study.json").write_bytes((study / "study.json").read_bytes())
-    assert type_study("--resume", "copy", "--no-report")[0] == 0
+    (own_folder / "copy").mkdir()
+    (own_folder / "copy" / "study.json").write_bytes((study / "study.json").read_bytes())
+    assert typed("compare.py", "--resume", "copy", "--no-report")[0] == 0
     columns = ["agent", "seed", "final", "training", "n_timesteps"]
-    assert rows(folder / "copy")[columns].equals(rows(study)[columns])
-    code, _, err = type_study("--resume", "copy", "--seeds", 3)
+    assert rows(own_folder / "copy")[columns].equals(rows(study)[columns])
+    code, _, err = typed("compare.py", "--resume", "copy", "--seeds", 3)
     assert (code, "leave out seeds" in err) == (2, True)
 
 
-def test_films_and_pages_of_training(type_study, folder, monkeypatch):
+@pytest.mark.usefixtures("in_this_process")
+def test_films_and_pages_of_training(typed, own_folder, monkeypatch):
     # What takes longest.
     monkeypatch.setattr("rl_yardstick.report.figures.write_figures", lambda *_: [])
     monkeypatch.setattr("rl_yardstick.report.films.film_of", lambda _: None)
     words = ["--env", "FrozenLake-v1", "--algos", "qlearning", "--n-episodes", 40, "--seeds", 1]
     words += ["-j", 1, "-f", "studies", "--watch-learning", "--render-every", 20]
-    code, out, err = type_study(*words)
+    code, out, err = typed("compare.py", *words)
     assert (code, err) == (0, "")
-    study = folder / "studies" / "FrozenLake-v1_qlearning"
+    study = own_folder / "studies" / "FrozenLake-v1_qlearning"
     place = "learning/qlearning/FrozenLake-v1_1.html"
     assert place in out.split()
     assert "<h1>qlearning on FrozenLake-v1</h1>" in (study / place).read_text(encoding="utf-8")
@@ -153,7 +116,7 @@ def test_films_and_pages_of_training(type_study, folder, monkeypatch):
     for path in films:
         with Image.open(path) as film:
             assert film.n_frames > 1
-    code, out, err = type_study(*words, "--no-report")
+    code, out, err = typed("compare.py", *words, "--no-report")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "leave out --no-report" in err
 
@@ -177,13 +140,16 @@ def session_of(leader):
     return found
 
 
-SLOW = ["--env", "Slow-v0", "--gym-packages", "walks", "--algos", "qlearning"]
+WALKS = Path(__file__).parents[1] / "experiments" / "walks.py"
+SLOW = ["--env", "Walk-v0", "--env-kwargs", "is_slow:True", "--gym-packages", "walks"]
+SLOW += ["--algos", "qlearning"]
 SLOW += ["--no-report", "-n", "2000", "--seeds", "2", "-j", "2", "-f", "studies"]
 
 
 @pytest.fixture
-def begun(folder):
+def begun(own_folder):
     """A study in the middle of its runs: the command, its folder, all of its processes."""
+    shutil.copy(WALKS, own_folder)
     process = subprocess.Popen(
         [sys.executable, str(COMPARE), *SLOW],
         stdout=subprocess.PIPE,
@@ -191,7 +157,7 @@ def begun(folder):
         text=True,
         start_new_session=True,
     )
-    study = folder / "studies" / "Slow-v0_qlearning"
+    study = own_folder / "studies" / "Walk-v0_qlearning"
     wait_for(lambda: len(list(study.glob("runs/*/*/state.bin"))) == 2)
     yield process, study, session_of(process.pid)
     if process.poll() is None:
@@ -203,10 +169,10 @@ def states(study):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_the_same_command_does_what_is_left(number, type_study, folder, begun):
+def test_the_same_command_does_what_is_left(number, typed, own_folder, begun):
     process, study, started = begun
     # A second command says that the folder is in use, and touches nothing.
-    code, _, err = type_study(*SLOW, "-params", "gamma:0.5", "--replace")
+    code, _, err = typed("compare.py", *SLOW, "-params", "gamma:0.5", "--replace")
     assert (code, err.count("\n"), "in use by another command" in err) == (2, 1, True)
     # A terminal sends a signal to all processes.
     (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
@@ -216,11 +182,11 @@ def test_the_same_command_does_what_is_left(number, type_study, folder, begun):
         assert process.returncode == -number
     else:
         assert (process.returncode, err) == (128 + number, "")
-        assert f"stopped; continue with: python {COMPARE} --resume studies/Slow-v0_qlearning" in out
+        assert f"stopped; continue with: python {COMPARE} --resume studies/Walk-v0_qlearning" in out
         assert states(study) == ["interrupted"] * 2
-    (folder / "mark").touch()
+    (own_folder / "mark").touch()
     begun_at = {path: path.stat().st_mtime_ns for path in study.glob("runs/*/*/0.monitor.csv")}
-    code, out, _ = type_study("--resume", study, "--gym-packages", "walks", "--no-report")
+    code, out, _ = typed("compare.py", "--resume", study, "--gym-packages", "walks", "--no-report")
     assert (code, "2 runs, 0 of them there already" in out) == (0, True)
     assert len(begun_at) == 2
     assert states(study) == ["finished"] * 2
@@ -242,17 +208,18 @@ def last_line(out):
     return [line for line in out.splitlines() if line][-1]
 
 
-def test_it_grows_until_decided_and_remembers_its_looks(type_study, folder):
-    (folder / "bandits.yml").write_text(BANDITS)
+@pytest.mark.usefixtures("in_this_process")
+def test_it_grows_until_decided_and_remembers_its_looks(typed, own_folder):
+    (own_folder / "bandits.yml").write_text(BANDITS)
     words = ["bandits.yml", "--until-decided", "--no-report", "--max-seeds", 14, "-j", 2, "-f", "s"]
-    code, whole, err = type_study(*words)
+    code, whole, err = typed("compare.py", *words)
     assert (code, err) == (0, "")
     assert "look 1 of 3, at 6 seeds: " in whole
-    study = folder / "s" / "bandits"
+    study = own_folder / "s" / "bandits"
     n_runs, record = len(rows(study)), (study / "study.json").read_bytes()
     last = f"{n_runs} runs, where 14 seeds of each agent would be 42; "
     assert last_line(whole).startswith(last)
-    code, out, _ = type_study(*words)
+    code, out, _ = typed("compare.py", *words)
     assert (code, last_line(out)) == (0, last_line(whole))
     assert (study / "study.json").read_bytes() == record
 
@@ -314,6 +281,7 @@ def files(own_folder):
     (own_folder / "blind.yml").write_text(BLIND)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_search_finds_better_settings_and_its_re_test_grows_until_decided(typed, files):
     code, out, err = typed("tune.py", *SEARCH.split())
     assert (code, err) == (0, "")
@@ -337,12 +305,7 @@ def test_a_search_finds_better_settings_and_its_re_test_grows_until_decided(type
     code, _, err = typed("tune.py", *SEARCH.split(), "--max-retest-seeds", "20")
     assert (code, err.count("\n")) == (2, 1)
     assert "the looks were planned before the first of them and cannot change" in err
-
-
-def test_one_command_at_a_time_works_on_a_search(typed, files):
-    PLACE.mkdir(parents=True)
     with FileLock(PLACE / ".lock"):
         code, _, err = typed("tune.py", *SEARCH.split())
     assert (code, err.count("\n")) == (2, 1)
     assert f"{PLACE} is in use by another command" in err
-    assert not (PLACE / "trials.db").exists()

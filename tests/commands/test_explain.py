@@ -41,6 +41,7 @@ def test_a_run_is_explained_in_twelve_lines_and_as_json(type_command, run):
     assert zipped.splitlines()[1:] == out.splitlines()[1:]
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, run):
     words = ("--test", "n_timesteps:60000", "--test", "gamma:0.5", "--json", "why.json")
     code, out, _ = type_command("explain", run, *words, "-j", 1)

@@ -4,7 +4,6 @@ import base64
 import gzip
 import json
 import re
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -88,21 +87,7 @@ def test_a_page_is_no_larger_than_three_megabytes(watched, page_of, monkeypatch)
     assert max(cut["changes"]["step"]) < n_steps
 
 
-class Here(ThreadPoolExecutor):
-    """A pool of this process: another one would import all libraries."""
-
-    def stop(self):
-        self.shutdown()
-
-    def join(self):
-        """All is done."""
-
-    def submit(self, function, timeout, *args):
-        return super().submit(function, *args)
-
-
-def test_each_agent_that_learns_is_shown_once_and_kept(do_study, tmp_path, monkeypatch):
-    monkeypatch.setattr(learning, "process_pool", Here)
+def test_each_agent_that_learns_is_shown_once_and_kept(do_study, tmp_path, in_this_process):
     agents = (AgentSpec("Q-learning & co", "qlearning"), AgentSpec(HOSTILE, "random"))
     places = (EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1", {"n_timesteps": 300}),)
     analysis = analyse(do_study(StudySpec("small", "", agents, places, n_seeds=1), tmp_path))
