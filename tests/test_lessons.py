@@ -312,8 +312,8 @@ CASES = {
 @pytest.mark.parametrize(
     ("check", "answer", "said"),
     [
-        pytest.param(check, answer, said, id=f"{check.__name__} {place}: {said}")
-        for check, rows in CASES.items()
+        pytest.param(check, answer, said, id=f"{number} {place}: {said}")
+        for number, (check, rows) in enumerate(CASES.items())
         for place, (answer, said) in enumerate(rows)
     ],
 )

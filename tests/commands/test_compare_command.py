@@ -72,21 +72,12 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(typed, own_fo
     paths = (place / "sarsa" / "FrozenLake-v1_1" / "0.monitor.csv" for place in places)
     theirs, ours = (pd.read_csv(path, skiprows=1)[["r", "l"]] for path in paths)
     assert theirs.equals(ours)
-    # Finished runs of other settings are replaced only when that is asked for.
-    first, other = records(study), [*PAIR, "--seeds", 2, "-params", "gamma:0.9"]
-    code, out, err = typed("compare.py", *other)
+    # Finished runs of other settings stay as they are.
+    first = records(study)
+    code, out, err = typed("compare.py", *PAIR, "--seeds", 2, "-params", "gamma:0.9")
     assert (code, err.count("\n")) == (2, 1)
-    assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now): --name" in err
+    assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now): " in err
     assert records(study) == first
-    code, out, _ = typed("compare.py", *other, "--replace")
-    assert (code, "4 runs, 0 of them there already" in out) == (0, True)
-    assert not set(records(study).values()) & set(first.values())
-    place = study / "replaced" / "1"
-    assert (
-        f"4 runs are done again: the old folders are in {place.relative_to(own_folder)} now" in out
-    )
-    place.rename(place.parent / "runs")
-    assert records(place.parent) == first
     # What a study's record says is enough to do it elsewhere.
     (own_folder / "copy").mkdir()
     (own_folder / "copy" / "study.json").write_bytes((study / "study.json").read_bytes())
@@ -172,7 +163,7 @@ def states(study):
 def test_the_same_command_does_what_is_left(number, typed, own_folder, begun):
     process, study, started = begun
     # A second command says that the folder is in use, and touches nothing.
-    code, _, err = typed("compare.py", *SLOW, "-params", "gamma:0.5", "--replace")
+    code, _, err = typed("compare.py", *SLOW, "-params", "gamma:0.5")
     assert (code, err.count("\n"), "in use by another command" in err) == (2, 1, True)
     # A terminal sends a signal to all processes.
     (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)

@@ -11,7 +11,7 @@ from rl_yardstick.diagnosis import target_probes
 from rl_yardstick.diagnosis.audit import audit
 from rl_yardstick.pipeline.settings import read_entry
 from rl_yardstick.report.documents import write_tables
-from tests.pipeline.short_runs import CART, LAKE, trained
+from tests.pipeline.short_runs import LAKE, trained
 
 
 @pytest.fixture(scope="module")
@@ -51,18 +51,16 @@ def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, r
     assert code == 0
     assert [*tried] == ["as shipped", "as it is", "n_timesteps:60000", "gamma:0.5"]
     assert {len(returns) for returns in tried.values()} == {4}
-    assert "16 runs, about" in out
     assert "n_timesteps:60000 helps most" in out
     assert "16 runs, 16 of them there already" in type_command("explain", run, *words)[1]
 
 
-def test_checkpoints_show_the_course_and_two_agents_where_they_part(type_command, run, tmp_path):
+def test_two_agents_where_they_part(type_command, run, tmp_path):
     last = f"{run}/rl_model_1000_steps.zip"
-    words = ("--course", "--against", last, "--map", "costs.png", "--json", "why.json")
+    words = ("--against", last, "--map", "costs.png", "--json", "why.json")
     code, out, _ = type_command("explain", run, *words)
     data = json.loads(Path("why.json").read_text())
     assert code == 0
-    assert [row["timesteps"] for row in data["course"]] == [1000, 2000, 3000]
     assert sum(place["gain"] for place in data["against"]["places"]) == pytest.approx(
         data["against"]["difference"]
     )
@@ -71,11 +69,9 @@ def test_checkpoints_show_the_course_and_two_agents_where_they_part(type_command
 
 
 def test_what_cannot_be_explained_is_refused_in_one_line(type_command, run):
-    cart = trained("random", CART, n_timesteps=100)[0].path
     for words, line in (
         ([run, "--test", "gama:0.9"], "gama"),
         ([run, "--map", "costs.svg"], "--map writes a .png"),
-        ([cart, "--course"], "the model of CartPole-v1 is not known"),
     ):
         code, _, err = type_command("explain", *words)
         assert (code, err.count("\n")) == (2, 1)

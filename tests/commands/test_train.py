@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from rl_yardstick.commands.terminal import result_lines
-from rl_yardstick.commands.train import describe_pulls, next_commands, other_agent, rows_of
+from rl_yardstick.commands.train import describe_pulls, next_commands, rows_of
 from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.pipeline.callbacks import PullSummary
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
@@ -37,83 +37,72 @@ def exact(value, success, *yardstick, **more):
 
 
 POLE = Yardstick(optimum=500.0, baseline=20.0, at_least=480.0)
-OF_POLE = ["score 0   return 20   best random or constant policy", "optimum   480 to 500"]
-WAREHOUSE = "score 0   return -1000   best random or constant policy"
+NOTHING = "score 0   return 0   best random or constant policy"
 HIDES = HiddenState(95.8, (93.8, 93.8), with_memory=False)
 PULLS = {"n_pulls": 1000, "n_matched": 1000, "reward": 0.5, "optimal": 0.85}
 # The final evaluation, the pulls, and how the output ends.
-ENDS = {
-    "exact": (
-        exact(0.740206, 0.740206, 0.744190, 0.0495),
-        None,
+BEST = "best random or constant policy"
+ENDS = [
+    # Exact, optimal, nearly optimal.
+    (
+        *(exact(0.740206, 0.740206, 0.744190, 0.0495), None),
         "score 0.99   return 0.7402 of 0.7442 (gap 0.0040)   success 74 %",
-        "score 0   return 0.0495   best random or constant policy",
+        f"score 0   return 0.0495   {BEST}",
     ),
-    "nearly optimal": (
-        exact(79 - 1e-9, 1 - 1e-4, 79.0, -1000.0),
-        None,
-        "score 0.99   return 79 of 79 (gap 1e-09)   success 99.9 %",
-        WAREHOUSE,
+    (exact(79 - 1e-14, 1.0, 79.0, 0.0), None, "score 1   return 79 of 79   success 100 %", NOTHING),
+    (
+        *(exact(79 - 1e-9, 1 - 1e-4, 79.0, 0.0), None),
+        *("score 0.99   return 79 of 79 (gap 1e-09)   success 99.9 %", NOTHING),
     ),
-    "sampled": (
-        sampled(78.5, 79.0, yardstick=Yardstick(79.0, -1000.0)),
-        None,
-        "score 0.99   return 78.75 of 79 (gap 0.25; sampled, 2 episodes)",
-        WAREHOUSE,
+    # Sampled, also between brackets, with a proof or not.
+    (
+        *(sampled(78.5, 79.0, yardstick=Yardstick(79.0, 0.0)), None),
+        *("score 0.99   return 78.75 of 79 (gap 0.25; sampled, 2 episodes)", NOTHING),
     ),
-    "far": (
-        exact(-1000.0, None, -11.66, -12.0),
-        None,
-        "score -2905.89   return -1000 of -11.66 (gap 988.34)",
-        "score 0   return -12   best random or constant policy",
-    ),
-    "bracketed": (
-        sampled(260.0, yardstick=POLE),
-        None,
+    (
+        *(sampled(260.0, yardstick=POLE), None),
         "score 0.50 to 0.52   return 260 of 500 at most (sampled, 1 episode)",
-        *OF_POLE,
+        *(f"score 0   return 20   {BEST}", "optimum   480 to 500"),
     ),
-    "bracketed without a proof": (
-        sampled(500.0, yardstick=replace(POLE, at_least=500.0, is_proven=False)),
-        None,
+    (
+        *(sampled(500.0, yardstick=replace(POLE, at_least=500.0, is_proven=False)), None),
         "score 1   return 500 of 500 at most (not proven; sampled, 1 episode)",
-        OF_POLE[0],
-        "optimum   500 (the upper end is not proven)",
+        *(f"score 0   return 20   {BEST}", "optimum   500 (the upper end is not proven)"),
     ),
-    "no optimum": (sampled(*[487.25] * 100), None, "return 487.2 (sampled, 100 episodes)"),
-    "no scale": (
-        exact(749.5, None, 750.0, 750.0),
-        None,
-        "return 749.5 of 750 (gap 0.5)",
-        "no score   return 750   best random or constant policy",
+    # Far below the scale, without an optimum, without a scale.
+    (
+        *(exact(-1000.0, None, -11.66, -12.0), None),
+        "score -2905.89   return -1000 of -11.66 (gap 988.34)",
+        f"score 0   return -12   {BEST}",
     ),
-    "hidden state": (
-        exact(-80.0, 1 / 15, 93.8, -40.0, 35.0, hidden=HIDES),
-        None,
+    (sampled(*[487.25] * 100), None, "return 487.2 (sampled, 100 episodes)"),
+    (
+        *(exact(749.5, None, 750.0, 750.0), None),
+        *("return 749.5 of 750 (gap 0.5)", f"no score   return 750   {BEST}"),
+    ),
+    (
+        *(exact(-80.0, 1 / 15, 93.8, -40.0, 35.0, hidden=HIDES), None),
         "score -0.54 to -0.30   return -80 of 93.80 at most   success 6.7 %",
-        "score 0   return -40   best random or constant policy",
+        f"score 0   return -40   {BEST}",
         "optimum   35 to 93.80 without memory, 93.80 with memory, 95.80 by the state",
     ),
-    "bandit": (
-        exact(159.0, None, 159.0, 117.0),
-        PullSummary(regret=127.984, **PULLS),
+    # Bandits.
+    (
+        *(exact(159.0, None, 159.0, 117.0), PullSummary(regret=127.984, **PULLS)),
         "regret 127.98 over 1,000 pulls   best arm in 85 % of the last 100",
-        "score 1   return 159 of 159",
-        "score 0   return 117   best random or constant policy",
+        *("score 1   return 159 of 159", f"score 0   return 117   {BEST}"),
     ),
-    "bandit from a log": (
-        None,
-        PullSummary(regret=None, **PULLS),
+    (
+        *(None, PullSummary(regret=None, **PULLS)),
         "regret not known   reward 0.5000 a pull over the 1,000 of 1,000 that are in the log",
     ),
-}
+]
 
 
-@pytest.mark.parametrize("case", ENDS)
-def test_how_a_run_ends(case):
-    final, pulls, *lines = ENDS[case]
-    told = [] if pulls is None else [describe_pulls(pulls)]
-    assert told + ([] if final is None else result_lines(final)) == lines
+def test_how_a_run_ends():
+    for final, pulls, *lines in ENDS:
+        told = [] if pulls is None else [describe_pulls(pulls)]
+        assert told + ([] if final is None else result_lines(final)) == lines
 
 
 def test_what_was_done():
@@ -152,24 +141,11 @@ def test_what_to_type_next(monkeypatch, tmp_path):
     assert next_commands(spec, older, plain)[0] == ("watch", f"python enjoy.py '{run.path}'")
 
 
-@pytest.mark.parametrize(
-    ("algo", "env_id", "other"),
-    [
-        ("qlearning", "FrozenLake-v1", "sarsa"),
-        ("ppo", "Pendulum-v1", "sac"),
-        ("thompson", "BernoulliBandit-v0", "epsilon_greedy"),
-    ],
-)
-def test_the_other_agent_fits(algo, env_id, other):
-    assert other_agent(spec_of(algo, env_id)) == other
-
-
-def test_the_head_tells_what_auto_stands_for_and_what_a_discount_costs(type_command, tmp_path):
+def test_the_head_tells_what_auto_stands_for(type_command, tmp_path):
     slipping = ["--algo", "qlearning", "--env", "Warehouse-v0", "--env-kwargs", "slip:0.2"]
     code, out, _ = type_command("train.py", *slipping, "-n", "500")
     assert code == 0
     assert "gamma=0.9995 (auto: 1 - 1/(2 x time limit of 1,000))" in " ".join(out.split())
-    assert "exact planning" not in out
     run = tmp_path / "logs" / "qlearning" / "Warehouse-v0_1"
     spec = json.loads((run / "run.json").read_text())["spec"]
     assert (spec["algorithm"]["gamma"], *spec["origins"]) == (0.9995, "gamma", "learning_rate")

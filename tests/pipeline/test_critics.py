@@ -291,18 +291,6 @@ def test_where_it_cannot_be_done_a_line_says_so(tmp_path):
     parts.close()
 
 
-def test_comparisons_are_thinned_out_evenly_and_by_no_clock(tmp_path, monkeypatch):
-    monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 0.0)
-    monkeypatch.setattr(critics, "SHARE", 1.0)
-    monkeypatch.setattr(critics, "seconds_per_step", lambda _: 1e-3)
-    monkeypatch.setattr(critics, "seconds_of_comparison", lambda *_, **__: 0.39)
-    spec = resumable(LAKE, "qlearning", 2000, {}, diagnose=True)
-    steps = [row["timesteps"] for row in rows_of(run_of(spec, tmp_path)[0])]
-    assert steps == [400, 800, 1200, 1600, 2000]  # of 20 evaluations
-    each = resumable(LAKE, "qlearning", 500, {}, diagnose=True, eval_freq=50)
-    assert len(rows_of(run_of(each, tmp_path)[0])) == 10
-
-
 def test_where_states_look_alike_values_are_compared_and_rollouts_are_not():
     spec = spec_of("ppo", "ShortCorridor-v0")
     agent = agent_of("ppo", make_training_env(spec, None), device="cpu")

@@ -15,7 +15,6 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
 
 from rl_yardstick.pipeline import files
 from rl_yardstick.pipeline.callbacks import EvaluationCallback
@@ -278,12 +277,9 @@ def test_what_only_the_constructor_knows_is_one_line_and_leaves_no_folder(algo, 
     assert not Path("logs").exists()
 
 
-def test_remarks_and_pictures(monkeypatch):
-    console = Console(record=True, width=200, force_terminal=False)
-    spec = spec_of("qlearning", LAKE, {"gamma": 0.5}, n_timesteps=2000, diagnose=True)
-    run, outcome = run_of(spec.changed(pictures=True), console=console)
-    text = console.export_text()
-    assert "at gamma 0.5 even exact planning scores" in text
+def test_pictures():
+    spec = spec_of("qlearning", LAKE, n_timesteps=2000, diagnose=True)
+    run, outcome = run_of(spec.changed(pictures=True))
     assert outcome.can_be_explained
     for name in ("learning_curve.png", "value_map.png", "diagnosis.png"):
         assert (run.path / name).stat().st_size > 5000

@@ -13,22 +13,18 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.compiled import greedy_play
-from rl_yardstick.commands.terminal import result_lines
 from rl_yardstick.envs.wrappers import DiscretizeObservation
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
 from rl_yardstick.pipeline.evaluation import sampled
 from rl_yardstick.pipeline.evaluation.sampled import (
     Evaluation,
     SampledEvaluator,
-    Shares,
     Yardstick,
-    allowed_steps,
     bracketed_yardstick,
     compiled_copy,
     evaluate,
     evaluate_compiled,
     evaluation_seed,
-    is_sure,
 )
 from rl_yardstick.pipeline.settings import HYPERPARAMS, TUNED_ON, read_yaml
 from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of, trained
@@ -119,21 +115,6 @@ def test_training_is_the_same_with_and_without_evaluations(tmp_path):
     assert found.ret_rms.var == other.ret_rms.var
 
 
-def test_when_a_mean_is_sure():
-    assert is_sure(episodes(*[7.0] * 10), 0.01)
-    assert not is_sure(episodes(*[7.0] * 5), 0.01), "five may be alike by chance"
-    # 9 and 11 in turn: mean 10, standard deviation sqrt(10/9), standard error 1/3.
-    assert is_sure(episodes(*[9.0, 11.0] * 5), 0.0334)
-    assert not is_sure(episodes(*[9.0, 11.0] * 5), 0.0333)
-    assert not is_sure(episodes(*[-1.0, 1.0] * 5), 0.5)
-
-
-def test_how_many_steps_are_allowed():
-    """A fifth of a short training, and from 10,000 on a hundredth; 2,000 in any case."""
-    allowed = [allowed_steps(n, Shares(1 / 100, 1 / 5)) for n in (1e3, 2e4, 4e5, 5e6)]
-    assert allowed == [2000, 4000, 10_000, 50_000]
-
-
 class Steady(gym.Env):
     """Episodes of one length, with the returns that are given, again and again."""
 
@@ -218,30 +199,12 @@ def test_the_upper_end_measures_and_the_lower_stands_beside_it():
     assert (figures["gap"], figures["gap_at_least"]) == (240, 220)
     assert (figures["score"], figures["score_at_most"]) == (0.5, pytest.approx(240 / 460))
     assert not figures["exact"]
-    assert "beats_optimum" not in figures
     known = episodes(80.0, yardstick=Yardstick(100.0, 60.0)).summary()
     assert known["score"] == 0.5
     assert not {"optimum_at_least", "gap_at_least", "score_at_most"} & known.keys()
     guessed = bracketed_yardstick(spec_of("random", "Acrobot-v1"))
     assert guessed == Yardstick(-38.0, -498.625, -60.408, is_proven=False)
     assert episodes(-40.0, yardstick=guessed).summary()["optimum_is_proven"] is False
-
-
-@pytest.mark.parametrize(
-    ("returns", "yardstick", "alarm"),
-    [
-        ([501.0] * 10, POLE, True),
-        ([500.0000004] * 10, POLE, False),  # as Monitor rounds
-        ([120.0] * 10, Yardstick(100.0, 60.0), False),  # a known optimum
-    ],
-)
-def test_more_than_any_policy_can_reach_is_said_aloud_and_not_clipped(returns, yardstick, alarm):
-    found = episodes(*returns, yardstick=yardstick)
-    assert found.beats_optimum is alarm
-    assert ("THIS IS MORE THAN ANY POLICY CAN REACH" in result_lines(found)[-1]) is alarm
-    assert found.summary().get("beats_optimum", False) is alarm
-    if alarm:
-        assert found.summary()["score"] == pytest.approx(481 / 480)
 
 
 WIDTHS = {"low": [-2.4, -3.0, -0.21, -3.0], "high": [2.4, 3.0, 0.21, 3.0]}

@@ -16,7 +16,6 @@ from rl_yardstick.pipeline.arguments import read_signature
 from rl_yardstick.pipeline.components import constructor_arguments
 from rl_yardstick.pipeline.environments import check_fit, make_single_env
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.evaluation.exact import discount_note, exact_evaluator
 from rl_yardstick.pipeline.settings import (
     HYPERPARAMS,
     SPECIAL,
@@ -54,9 +53,6 @@ LITERALS = [
     ("'text'", "text"),
     ("map.txt", "map.txt"),
     ("C:\\maps\\a.txt", "C:\\maps\\a.txt"),
-    ("None", None),
-    ("null", None),
-    ("False", False),
     ("false", False),
     ("[SFFF, FFFG]", ["SFFF", "FFFG"]),
     ("dict(net_arch=dict(pi=[64], vf=[64]))", {"net_arch": {"pi": [64], "vf": [64]}}),
@@ -101,12 +97,8 @@ MISTAKES = [
     ("ppo", {"noise_std": 0.1}, "no hyperparameter 'noise_std'"),
     ("td3", {"action_noise": 0.1}, "action_noise is set by noise_type and noise_std"),
     ("ppo", {"gamma": 1.5}, "gamma must be a number, not 1.5"),
-    ("ppo", {"gamma": "much"}, "gamma must be a number, not 'much'"),
     ("ppo", {"gamma": float("nan")}, "gamma must be"),
-    ("ppo", {"gamma": True}, "gamma must be a number, not True"),
-    ("ppo", {"learning_rate": -1}, "learning_rate must be"),
     ("ppo", {"learning_rate": "fast"}, "a number or a schedule such as lin_0.001, not 'fast'"),
-    ("ppo", {"batch_size": 0}, "batch_size must be a whole number, not 0"),
     ("ppo", {"batch_size": 1.5}, "batch_size must be a whole number, not 1.5"),
     ("ppo", {"policy_kwargs": [1]}, "policy_kwargs must be"),
     ("dqn", {"train_freq": "often"}, "train_freq must be a whole number, not 'often'"),
@@ -114,10 +106,6 @@ MISTAKES = [
     ("qlearning", {"tie_breaking": "frist"}, "not 'frist'"),
     ("qlearning", {"tie_breaking": 0}, "tie_breaking must be first or random, not 0"),
     ("ppo", {"n_timesteps": 0}, "n_timesteps: input should be greater than 0, not 0"),
-    ("ppo", {"n_timesteps": 1.5}, "n_timesteps: "),
-    ("ppo", {"n_timesteps": "x"}, "n_timesteps: "),
-    ("ppo", {"n_episodes": 1}, "give n_timesteps or n_episodes, not both"),
-    ("ppo", {"n_envs": 0}, "n_envs: "),
     ("ppo", {"normalize": {"norm_ob": True}}, "normalize: unknown argument 'norm_ob'"),
     ("ppo", {"normalize": {"norm_obs": "often"}}, "normalize: norm_obs must be true or false"),
     ("ppo", {"normalize": 1}, "normalize must be a mapping"),
@@ -142,7 +130,6 @@ def test_mistakes_are_one_line(algo, entry, said):
 FILE_MISTAKES = [
     ("- a\n- b\n", "must map environment ids to hyperparameters"),
     ("A: 5\n", "the entry A must map names to values"),
-    ("A:\n  gamma: [0.9\n", "is no valid YAML"),
     ("A:\n  gamma: 1\n  gamma: 2\n", "the key 'gamma' is there twice"),
     ("A: {x: !!python/object/apply:os.system ['x']}\n", "is no valid YAML"),
     ("A: {}\n---\nB: {}\n", "is no valid YAML"),
@@ -355,17 +342,3 @@ def test_what_cannot_be_worked_out_is_refused(env_id, raw, said, monkeypatch):
     gym.register("Unknown-v0", Unknown)
     with pytest.raises(UserError, match=said):
         spec_of("qlearning", env_id, **raw)
-
-
-@pytest.mark.parametrize(
-    ("slip", "gamma", "note"),
-    [
-        (0.2, 0.99, "at gamma 0.99 even exact planning scores 0.00 here; 0.9995: 1.00"),
-        (0.2, 0.9995, None),
-        (0.0, 0.5, None),  # the shortest way is the best at any discount
-    ],
-)
-def test_what_a_discount_costs_is_planned_exactly(slip, gamma, note):
-    spec = spec_of("qlearning", "Warehouse-v0", env_kwargs={"slip": slip})
-    found = discount_note(spec, exact_evaluator(spec), gamma)
-    assert found == (note and f"{note} (gamma: auto)")
