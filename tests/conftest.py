@@ -8,7 +8,6 @@ import signal
 import sys
 import tempfile
 from concurrent.futures import Future
-from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -78,23 +77,6 @@ def signals_are_left_as_they_were():
         if after[number] != before[number]:
             signal.signal(number, before[number])
     assert after == before
-
-
-@pytest.fixture
-def small_disk():
-    """Within the ``with`` statement no file may have more bytes than so many."""
-    resource = pytest.importorskip("resource")
-
-    @contextmanager
-    def limited(n_bytes):
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-    return limited
 
 
 HOSTILE = "</script><script>document.title='taken'</script>"

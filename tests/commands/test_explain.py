@@ -164,45 +164,10 @@ def test_mistakes_end_in_one_line(type_command, tmp_path, words, told):
 
 RETURN = "optimal policies return"
 
-# A world of the user's whose rewards may be shaped by a potential: how far a walker has come.
-WALK = """
-import gymnasium as gym
-import numpy as np
-
-
-class Walk(gym.Env):
-    def __init__(self, scale=0.0, gamma=0.9, loop=0.0):
-        self.observation_space = gym.spaces.Discrete(4)
-        self.action_space = gym.spaces.Discrete(2)
-        self.initial_state_distrib = np.array([1.0, 0.0, 0.0, 0.0])
-        potential = [0.0, scale, 2 * scale, 3 * scale]
-        self.P = {}
-        for s in range(4):
-            self.P[s] = {}
-            for a, after in enumerate((max(s - 1, 0), s + 1)):
-                ends = after == 4
-                reward = (10.0 if ends else -1.0) - potential[s]
-                reward += (0.0 if ends else gamma * potential[after]) + loop * (after == s + 1)
-                self.P[s][a] = [(1.0, min(after, 3), reward, ends)]
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.s = 0
-        return 0, {}
-
-    def step(self, action):
-        _, self.s, reward, ends = self.P[self.s][int(action)][0]
-        return self.s, reward, ends, False, {}
-
-
-gym.register("Walk-v0", entry_point=f"{__name__}:Walk", max_episode_steps=20)
-"""
-
 
 @pytest.fixture
-def shape(type_command, tmp_path):
+def shape(type_command):
     """Type the command: its lines, and what it writes."""
-    (tmp_path / "walk.py").write_text(WALK)
 
     def run(*words):
         code, out, err = type_command("shaping", *words, "--json", "s.json")
@@ -214,9 +179,8 @@ def shape(type_command, tmp_path):
 
 def test_the_shipped_changes_of_warehouses_cost_nothing(shape):
     lines, data = shape("--env", "Warehouse-v0", "--algo", "ppo")
-    assert lines[0].endswith(
-        "random starts, episodes of 100 steps, rewards clipped at -10, rewards x 0.01"
-    )
+    told = "random starts, episodes of 100 steps, rewards clipped at -10, rewards x 0.01"
+    assert lines[0].endswith(told)
     assert lines[1:3] == [
         "discount 0.9995: the same policies are optimal",
         f"  with the changes {RETURN} 79; the optimum is 79: the changes cost nothing",
@@ -226,27 +190,15 @@ def test_the_shipped_changes_of_warehouses_cost_nothing(shape):
     assert data["objectives"][0]["factor"] is None  # clipping is no potential
 
 
-def test_a_potential_costs_nothing_and_a_bonus_for_every_step_forward_costs_all(shape):
-    walk = ("--gym-packages", "walk.py", "--env", "Walk-v0", "--gamma")
-    lines, data = shape(*walk, 0.9, "--train-env-kwargs", "scale:5")
-    assert lines[1] == "discount 0.9: the same policies are optimal"
-    assert lines[-1] == (
-        "the changed rewards are the original ones plus the difference of a potential, "
-        "which goes from 0 to 15"
+def test_rewards_that_make_another_policy_optimal(shape):
+    words = ("--gamma", 0.9, "--train-env-kwargs", "reward_schedule:[1,-1,-0.5]")
+    lines, data = shape("--env", "FrozenLake-v1", *words)
+    assert lines[1].startswith("discount 0.9: NOT the same policies are optimal: the best actions")
+    assert sum(place["gain"] for place in data["objectives"][0]["states"]) == pytest.approx(
+        0.6971, abs=5e-5
     )
-    first = data["objectives"][0]
-    assert (first["factor"], first["cost"]) == (1, pytest.approx([0, 0], abs=1e-9))
-    assert first["potential"] == pytest.approx([0, 5, 10, 15])
-    lines, data = shape(*walk, 0.99, "--train-env-kwargs", "loop:10")
-    # The optimum goes straight on, for -1 -1 -1 +10; to and fro costs 1 in each of 20 steps.
-    assert lines[1].startswith("discount 0.99: NOT the same policies are optimal: the best actions")
-    places = data["objectives"][0]["states"]
-    assert sum(place["gain"] for place in places) == pytest.approx(27)
-    assert lines[2].startswith(
-        f"  {places[0]['state']}: best is action 1, with the changes action 0"
-    )
-    told = f"  with the changes {RETURN} -20; the optimum is 7: the changes cost 27"
-    assert told in lines
+    assert lines[2].startswith("  row 1, column 1: best is left, with the changes down or right; ")
+    assert lines[3].endswith("; the optimum is 0.74419: the changes cost 0.6971")
 
 
 def test_wrappers_in_order_and_the_agents_own_discount(shape):

@@ -93,14 +93,6 @@ def test_the_file_of_a_map_is_in_the_titles_and_not_in_the_folders(tmp_path):
     assert first.environment == "Warehouse-v0 (depot.txt)"
     assert (first.path.name, first.spec.map_name) == ("Warehouse-v0_1", "depot.txt")
     assert trained(*SHORT, *place).map_name == "depot.txt"
-    label = tuned("--algo", "qlearning", "-n", "60", *place).study.environments[0].label
-    assert label == "Warehouse-v0 (depot.txt)"
-    file = tmp_path / "mine.yml"
-    entry = f"{{env_kwargs: {{desc: '{path}'}}}}"
-    file.write_text(f"agents: [qlearning]\nenvironments:\n  Warehouse-v0: {entry}\n")
-    assert plan(compared(str(file)), tmp_path)[0].environment == "Warehouse-v0 (depot.txt)"
-    file.write_text(f"agents: [qlearning]\nenvironments:\n  own: {{id: Warehouse-v0, {entry[1:]}\n")
-    assert plan(compared(str(file)), tmp_path)[0].environment == "own"
 
 
 MEANINGS = [

@@ -14,10 +14,9 @@ import pytest
 import yaml
 
 from rl_yardstick.commands.terminal import result_lines
-from rl_yardstick.commands.train import describe_pulls, next_commands, rows_of
-from rl_yardstick.machine_code import WorkTime
+from rl_yardstick.commands.train import describe_pulls, next_commands
 from rl_yardstick.pipeline.callbacks import PullSummary
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
+from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
 from rl_yardstick.pipeline.run import Run
 from tests.pipeline.short_runs import spec_of
@@ -103,23 +102,6 @@ def test_how_a_run_ends():
     for final, pulls, *lines in ENDS:
         told = [] if pulls is None else [describe_pulls(pulls)]
         assert told + ([] if final is None else result_lines(final)) == lines
-
-
-def test_what_was_done():
-    others = OtherReturns("epsilon 0.1", 2.5, 0.9, 1.5, 1.75)
-    final = replace(sampled(1.0, 3.0, yardstick=POLE), others=others)
-    usual = {"n_timesteps": 1000, "taken": WorkTime(), "engine": "compiled", "final": final}
-    usual |= {"best": 20.0, "best_timesteps": 9, "best_episodes": 1, "evaluation_steps": 700}
-    outcome = SimpleNamespace(**usual, evaluating=WorkTime(3.0, 0.5))
-    assert rows_of(Run(Path("logs/qlearning/Lake-v1_3")), outcome) == [
-        ("trained", "1,000 steps in 0.0 s of processor time (1,000,000,000,000 steps/s)"),
-        ("engine", "compiled"),
-        ("beside", "return 2.500 with epsilon 0.1, as in training"),
-        ("beside", "return 1.500 of 1.750 (gap 0.250), discounted by 0.9"),
-        ("best", "score 0.00   return 20 of 500 at most (sampled, 1 episode)   at step 9"),
-        ("tests", "700 steps beside training (70% of it); 0.5 s of processor time"),
-        ("files", "logs/qlearning/Lake-v1_3"),
-    ]
 
 
 def test_what_to_type_next(monkeypatch, tmp_path):

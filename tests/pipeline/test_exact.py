@@ -17,7 +17,7 @@ from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single, exact_ev
 from rl_yardstick.pipeline.evaluation.histories import by_histories, world_of_memory
 from rl_yardstick.pipeline.evaluation.policies import action_figures, policy_matrix
 from rl_yardstick.pipeline.evaluation.sampled import evaluate
-from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick, with_memory
+from rl_yardstick.pipeline.evaluation.yardstick import Yardstick, with_memory
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of
 from tests.pipeline.short_runs import spec_of as spec_for
 
@@ -310,14 +310,6 @@ def test_of_tables_their_rows_of_tiles_their_sums_and_of_preferences_shares():
         assert (word, len(np.unique(shares)), shares.sum()) == ("probability", 1, pytest.approx(1))
 
 
-def test_of_a_network_values_whose_highest_it_takes():
-    agent, _ = figures_of("dqn", [0], buffer_size=10, **TINY)
-    for state in range(16):
-        word, values = action_figures(agent, np.array([state]))
-        assert (word, values.shape, len(set(values.tolist()))) == ("value", (4,), 4)
-        assert values.argmax() == agent.predict(np.array([state]), deterministic=True)[0]
-
-
 def test_of_a_policy_that_samples_its_probabilities_and_of_others_nothing():
     agent, (word, shares) = figures_of("ppo", [5], **TINY)
     with th.no_grad():
@@ -361,15 +353,6 @@ def test_figures_are_put_on_the_scale_of_memory_and_only_where_that_differs():
     plain = {"mean_return": 0.5, **yardstick_of("qlearning", LAKE).figures(0.5)}
     assert with_memory(plain) is plain
     assert "full_optimum" not in plain
-
-
-def test_a_bracket_on_the_scale_of_memory_has_both_of_its_ends():
-    hidden = HiddenState(full_optimum=1.0, memory_optimum=(0.7, 0.9), with_memory=False)
-    found = Yardstick(0.6, 0.2, at_least=0.4, hidden=hidden)
-    wider = with_memory({"mean_return": 0.5, **found.figures(0.5)})
-    assert (wider["optimum_at_least"], wider["optimum"]) == (0.7, 0.9)
-    assert wider["score"] == pytest.approx((0.5 - 0.2) / (0.9 - 0.2))
-    assert wider["score_at_most"] == pytest.approx((0.5 - 0.2) / (0.7 - 0.2))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -128,19 +129,21 @@ def test_an_error_is_recorded_and_what_was_written_stays(monkeypatch):
     assert (run.path / "best_model.zip").exists()
 
 
-def test_a_file_has_its_name_when_it_is_whole(tmp_path, small_disk):
+def test_a_file_has_its_name_when_it_is_whole(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("before")
     with pytest.raises(ZeroDivisionError), replacing(path) as beside:
         beside.write_text(f"half {beside.suffix == '.txt'}: {1 / 0}")
     assert path.read_text() == "before"
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    handler, limits = signal.getsignal(signal.SIGXFSZ), resource.getrlimit(resource.RLIMIT_FSIZE)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))  # as if the disk were full
     try:
-        too_large = pytest.raises(OSError, match="File too large")
-        with small_disk(10), too_large as full, replacing(path) as beside:
+        with pytest.raises(OSError, match="File too large") as full, replacing(path) as beside:
             beside.write_bytes(bytes(1000))
     finally:
-        signal.signal(signal.SIGXFSZ, before)
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
     assert full.value.filename == str(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.txt"]
 

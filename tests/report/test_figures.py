@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FixedLocator, PercentFormatter
 
 from rl_yardstick.experiments.analysis import OverallAnalysis
-from rl_yardstick.report.figures import draw_learning_curves, draw_runs, label_ends, write_figures
+from rl_yardstick.report.figures import draw_learning_curves, write_figures
 from rl_yardstick.report.series import (
     COLOURS,
     AgentRuns,
@@ -346,35 +346,3 @@ def test_what_stands_beside_curves():
     assert f"{title} | episodes | return" in lines
     ticks = [tick for tick in left.get_yticks() if abs(tick) < 2000]
     assert ticks == [-1000, -300, -100, -50, 0, 50, 100, 300, 1000]
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "n", "expected", "said"),
-    [
-        (80, 95, 5, "orange - (80 0) (95 0)", "mean, 95 % interval, each seed"),
-        (90, 90, 5, "orange D (90 0) (90 0)", "each seed; diamond: all runs are equal"),
-        (88, 92, 2, "orange - (88 0) (92 0)", "mean, range, each seed"),
-    ],
-)
-def test_an_interval_of_one_point_has_a_mark_and_few_runs_have_their_range(
-    low, high, n, expected, said
-):
-    axes, mean = Figure().subplots(), made_up.estimate(90.0, low, high, n)
-    runs = [AgentRuns("first", mean, np.arange(2), np.array([88, 92]))]
-    draw_runs(axes, EnvironmentSeries(made_up.environment(), None, runs, None, {}), "final", MARKS)
-    dots, interval, tick, _ = map(line_words, axes.get_lines())
-    assert (dots, tick) == ("orange . (88 -0.18) (92 0.18)", "orange | (90 0)")
-    assert interval == expected
-    assert axes.get_xlabel().replace("\n", " ").endswith(said)
-
-
-def test_names_at_the_ends_of_lines_never_overlap_and_make_the_figure_as_tall_as_they_need():
-    figure = Figure(figsize=(6, 3))
-    axes = figure.subplots()
-    axes.set_ylim(0, 1)
-    label_ends(axes, [(f"agent {n}", 1.0, 0.5, "black") for n in range(40)])
-    places = sorted(text.xyann[1] for text in axes.texts)  # shares of the height of the axes
-    assert len(places) == 40
-    inches = axes.get_position().height * figure.get_figheight()
-    assert min(np.diff(places)) * inches > 0.11  # eight points of print
-    assert 0 <= places[0] < places[-1] <= 1

@@ -16,18 +16,11 @@ from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.results import read_compared
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.report.films import MAX_BYTES, MAX_SIDE, film_of
-from rl_yardstick.report.page import render, result_sections, world_sections
+from rl_yardstick.report.page import render, world_sections
 from rl_yardstick.report.page.frame import Report
 from rl_yardstick.report.series import (
-    Curve,
-    EnvironmentSeries,
-    Grid,
-    StudySeries,
-    Sweep,
-    agent_marks,
     study_series,
 )
-from tests.report import made_up
 
 HOSTILE = "</script><script>document.title='taken'</script>"
 
@@ -165,32 +158,6 @@ def test_the_policy_allows_the_scripts_of_the_page_and_nothing_from_outside(page
     }
     assert set(directives["script-src"].split()) == hashes
     assert len(hashes) == 4
-
-
-def test_a_sweep_and_a_heat_map_stand_on_top_with_their_best_value(tmp_path):
-    labels = ["a = 1", "a = 2", "a = 3", "other"]
-    agents = [made_up.agent(label, 90.0 - 10 * n) for n, label in enumerate(labels)]
-    places = [made_up.environment(agents, label) for label in ("lake", "island")]
-    analysis = made_up.analysis(places, labels, tmp_path)
-    x, means = np.array([1.0, 2, 3]), np.array([[90.0, 80], [70, np.nan]])
-    sweep = Sweep("a", Curve(x, np.array([90.0, 80, 70]), x, x), tuple(labels[:3]))
-    grid = Grid(("a", "e"), ["1", "2"], ["3", "4"], means, [labels[:2], [labels[2], ""]])
-    series = (
-        EnvironmentSeries(places[0], None, (), None, {"swept": sweep}),
-        EnvironmentSeries(places[1], None, (), None, {}, {"swept": grid}),
-    )
-    report = Report(StudySeries(analysis, agent_marks(analysis.study), series), "compare")
-    page = Page(render(report, [result_sections.verdict(report)]))
-    (plot,) = [a for a, _ in page.all("div") if "data-card" in a]
-    first, second = page.data("data-verdict")["sweeps"]
-    assert (int(plot["data-card"]), list(first), second) == (0, ["swept"], {})
-    found = first["swept"]
-    assert (found["parameter"], found["x"], found["y"]) == ("a", [1, 2, 3], [90, 80, 70])
-    assert found["best"] == [True, False, False]
-    assert [text for a, text in page.all("td") if "best" in a.get("class", "")] == ["90 best mean"]
-    shaded = {text: a["style"] for a, text in page.all("td") if "--strength" in a.get("style", "")}
-    expected = {"90 best mean": 90, "80": 45, "70": 0}
-    assert shaded == {text: f"--strength: {share}%" for text, share in expected.items()}
 
 
 def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_study):

@@ -20,7 +20,6 @@ from rl_yardstick.report.series import (
     grids,
     lai_robbins_slope,
     learning_curves,
-    linear_up_to,
     mean_regret,
     regret_of_runs,
     run_series,
@@ -83,20 +82,6 @@ def test_runs_with_a_figure_by_seed(lake):
         (r.agent, r.seeds.tolist(), r.values.tolist(), r.mean.point) for r in run_series(*lake)
     ]
     assert found == [("b", [0], [8], 90), ("a", [0, 2], [4, 6], 40)]
-
-
-@pytest.mark.parametrize(
-    ("curves", "optimum", "expected"),
-    [
-        ([[-7900.0, -50.0, 70.0]], 79.0, 79.0),  # two decades beyond the optimum
-        ([[-7899.0, -50.0, 70.0]], 79.0, None),
-        ([[-300.0, 1.0, 2.0, 2.0]], None, 2.0),  # the end of the curve stands for the optimum
-        ([[np.nan, 1.0], [np.nan]], None, None),
-        ([[-99.0, 0.0]], 0.1, None),  # returns below one are never dwarfed by those below 100
-    ],
-)
-def test_where_an_axis_ceases_to_be_linear(curves, optimum, expected):
-    assert linear_up_to([np.array(curve) for curve in curves], optimum) == expected
 
 
 def swept(label, value, group="sarsa", name="alpha"):
