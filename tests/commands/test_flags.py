@@ -3,7 +3,6 @@
 import re
 
 import pytest
-from optuna.trial import create_trial
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.commands import compare, enjoy, train, tune
@@ -16,8 +15,6 @@ from rl_yardstick.experiments.study import StudySpec
 from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.spec import TrainSpec
-from rl_yardstick.tuning.retesting import retest_study
-from rl_yardstick.tuning.suggesting import planned_runs
 
 TRAIN, ENJOY, COMPARE = train, enjoy, compare
 LAKE = ["--env", "FrozenLake-v1"]
@@ -152,23 +149,6 @@ def test_what_is_refused_by_every_command():
     ):
         with pytest.raises(UserError, match=f"^{re.escape(complaint)}$"):
             ask()
-
-
-def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(tmp_path):
-    for words, search, retest in (
-        ("ppo", "auto", None),
-        ("ppo -params engine:compiled", "compiled", "compiled"),
-        ("double_dqn", None, None),
-    ):
-        tuning = tuned("--algo", *words.split())
-        entry = {"n_timesteps": 10, **tuning.agent.settings}
-        run, *_ = planned_runs(tuning, tmp_path, entry)
-        assert run.spec.algorithm.get("engine") == search
-        trial = create_trial(value=0.5, user_attrs={"settings": entry})
-        study = retest_study(tuning, tmp_path, [trial])
-        engines = {r.spec.algorithm.get("engine") for r in plan(study, tmp_path)}
-        assert engines == {retest}
-        assert tuning.identity(entry, {})["search_engine"] == search  # another makes another search
 
 
 def answer(module, words):

@@ -16,7 +16,6 @@ from rl_yardstick.experiments.results import (
     mixed_versions,
     read_episodes,
     read_results,
-    threshold_of,
     values_over_seeds,
 )
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
@@ -183,22 +182,6 @@ def test_a_run_with_files_that_cannot_be_read_is_left_out(name, tmp_path):
     ((left_out),) = found.left_out
     assert left_out.planned == first
     assert reason in left_out.reason
-
-
-@pytest.mark.parametrize(
-    ("env_id", "stated", "ends", "threshold"),
-    [
-        ("Warehouse-v0", None, {"optimum": 100.0, "baseline": 0.0}, 95.0),
-        ("Warehouse-v0", 7.0, {"optimum": 100.0, "baseline": 0.0}, 7.0),
-        ("CartPole-v1", None, {}, 475.0),
-        ("Pendulum-v1", None, {"optimum": -100.0, "optimum_at_least": -200.0}, -1200 + 0.95 * 1000),
-        ("FrozenLake-v1", None, {"optimum": 0.5}, -1200 + 0.95 * 1200.5),
-        ("Warehouse-v0", None, {}, None),
-    ],
-)
-def test_what_counts_as_solved(env_id, stated, ends, threshold):
-    found = threshold_of(study_of(threshold=stated), env_id, {"baseline": -1200.0, **ends})
-    assert found is threshold is None or found == pytest.approx(threshold)
 
 
 def test_ranks_estimates_and_pairs(tmp_path):

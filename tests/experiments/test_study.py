@@ -298,18 +298,6 @@ def test_a_run_of_other_settings_does_not_count(tmp_path):
     assert differences["gamma"][1] == 0.123
 
 
-def test_checkpoints_are_asked_of_the_first_seed_alone(tmp_path):
-    record(only(PLAIN, tmp_path))
-    first, second = plan(replace(PLAIN, render_every=5, n_seeds=2), tmp_path)
-    assert (first.spec.save_every_n_episodes, second.spec.save_every_n_episodes) == (5, -1)
-    assert not first.is_finished
-    record(first)
-    assert first.is_finished
-    # Without films, a run that has checkpoints is as good as one without.
-    assert only(PLAIN, tmp_path).is_finished
-    assert not only(replace(PLAIN, render_every=6), tmp_path).is_finished
-
-
 DQN, PPO, RANDOM = (AgentSpec(name, name) for name in ("dqn", "ppo", "random"))
 
 PLAIN_DQN = replace(DQN, tuned=False, settings={"policy": "MlpPolicy", "n_timesteps": 100})

@@ -1,14 +1,12 @@
 """What `--diagnose` compares, by hand, by finite differences and by many rollouts."""
 
 import csv
-import io
 from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from rich.console import Console
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -25,10 +23,8 @@ from rl_yardstick.pipeline.evaluation.critics import (
     recorder_of,
 )
 from rl_yardstick.pipeline.evaluation.policies import policy_matrix
-from rl_yardstick.pipeline.run import Run
-from rl_yardstick.pipeline.training import Parts
 from tests.envs.corridors import Corridor
-from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of
+from tests.pipeline.short_runs import LAKE, agent_of, run_of, spec_of
 from tests.pipeline.test_resuming import content
 from tests.pipeline.test_resuming import spec_of as resumable
 
@@ -278,17 +274,6 @@ def test_the_agent_is_the_same_to_the_last_bit(
     rows = rows_of(whole)
     assert len(rows) >= (1 if eval_freq is None else 4)
     assert np.isfinite([row[column] for row in rows[:4]]).all()
-
-
-def test_where_it_cannot_be_done_a_line_says_so(tmp_path):
-    spec = spec_of("ppo", CART, n_timesteps=50, diagnose=True)
-    file = io.StringIO()
-    parts = Parts(spec, Run(tmp_path, Console(file=file, width=1000)), False)
-    lines = file.getvalue().splitlines()
-    (line,) = [line for line in lines if line.startswith("no diagnosis")]
-    assert line.startswith("no diagnosis: the exact model of CartPole-v1 is not known")
-    assert parts.evaluation.critics is None
-    parts.close()
 
 
 def test_where_states_look_alike_values_are_compared_and_rollouts_are_not():

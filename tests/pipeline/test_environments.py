@@ -20,7 +20,6 @@ from rl_yardstick.pipeline.environments import (
     make_evaluation_env,
     make_single_env,
     make_training_env,
-    map_name,
     training_changes,
     training_kwargs,
     with_files_read,
@@ -179,21 +178,6 @@ def test_a_maps_rows_take_the_place_of_its_path_and_a_log_is_found_from_other_fo
     settings = {"env_kwargs": {"log": "pulls.csv"}, "eval_env_kwargs": {"log": "/a.csv"}}
     found = with_files_read("ReplayBandit-v0", settings)
     assert found == {**settings, "env_kwargs": {"log": str(tmp_path / "pulls.csv")}}
-
-
-def test_a_maps_name_is_that_of_the_file_that_is_evaluated_on():
-    path, other, rows = {"desc": "maps/depot.txt"}, {"desc": "b.txt"}, {"desc": "S.\n.G"}
-    for kwargs, expected in (
-        ({"env_kwargs": path}, "depot.txt"),
-        ({"env_kwargs": path, "eval_env_kwargs": other}, "b.txt"),
-        ({"env_kwargs": path, "eval_env_kwargs": {"slip": 0.1}}, "depot.txt"),
-        ({"env_kwargs": path, "eval_env_kwargs": {"desc": ["SG"]}}, ""),
-        ({"train_env_kwargs": path}, ""),
-        ({"env_kwargs": rows}, ""),
-        ({}, ""),
-    ):
-        assert map_name("Warehouse-v0", kwargs) == expected, kwargs
-    assert map_name("CartPole-v1", {"env_kwargs": path}) == ""
 
 
 KINDS = (nn.Module, optim.Optimizer, BaseBuffer)

@@ -15,9 +15,9 @@ from rl_yardstick.pipeline.evaluation import histories, policies
 from rl_yardstick.pipeline.evaluation.advice import advice
 from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
 from rl_yardstick.pipeline.evaluation.histories import by_histories, world_of_memory
-from rl_yardstick.pipeline.evaluation.policies import action_figures, policy_matrix
+from rl_yardstick.pipeline.evaluation.policies import policy_matrix
 from rl_yardstick.pipeline.evaluation.sampled import evaluate
-from rl_yardstick.pipeline.evaluation.yardstick import Yardstick, with_memory
+from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of
 from tests.pipeline.short_runs import spec_of as spec_for
 
@@ -283,45 +283,6 @@ def test_by_two_signals(start_value, n_steps, try_first):
     assert judged("Warehouse-v0", table, n_steps, gamma=0.99).try_first == try_first
 
 
-TINY = {"policy_kwargs": {"net_arch": [8]}}
-
-
-def figures_of(name, observation, env_id=LAKE, **arguments):
-    agent = agent_of(name, make_vec_env(env_id, 1, seed=0), **arguments)
-    return agent, action_figures(agent, np.array(observation))
-
-
-def test_of_tables_their_rows_of_tiles_their_sums_and_of_preferences_shares():
-    agent, _ = figures_of("double_qlearning", [3])
-    agent.policy.q_tables[:, 3] = th.tensor([[1.0, 2.0, 3.0, 4.0], [3.0, 2.0, 1.0, 0.0]])
-    word, numbers = action_figures(agent, np.array([3]))
-    assert (word, numbers.tolist()) == ("value", [2.0, 2.0, 2.0, 2.0])
-    for pooled in (False, True):
-        agent, _ = figures_of("epsilon_greedy", [1], "SegmentBandit-v0", ignore_context=pooled)
-        agent.policy.scores[-1] = th.tensor([0.25, 0.5, 0.75])
-        word, numbers = action_figures(agent, np.array([1]))
-        assert (word, numbers.tolist()) == ("score", [0.25, 0.5, 0.75])
-    for env_id, observation in ((LAKE, [5]), ("MountainCar-v0", [[-0.5, 0.01]])):
-        agent, _ = figures_of("semi_gradient_q", observation, env_id)
-        agent.policy.weights[:] = th.arange(agent.policy.weights.shape[1])
-        word, numbers = action_figures(agent, np.array(observation))
-        assert (word, np.unique(np.diff(numbers)).size) == ("value", 1)
-        _, (word, shares) = figures_of("actor_critic", observation, env_id)
-        assert (word, len(np.unique(shares)), shares.sum()) == ("probability", 1, pytest.approx(1))
-
-
-def test_of_a_policy_that_samples_its_probabilities_and_of_others_nothing():
-    agent, (word, shares) = figures_of("ppo", [5], **TINY)
-    with th.no_grad():
-        _, logs, _ = agent.policy.evaluate_actions(th.full((4,), 5), th.arange(4))
-    assert (word, shares.sum()) == ("probability", pytest.approx(1.0))
-    assert shares == pytest.approx(np.exp(logs.numpy()), rel=1e-5)
-    lstm = {"n_steps": 8, "policy_kwargs": {"lstm_hidden_size": 4}}
-    assert figures_of("random", [0])[1] is None
-    assert figures_of("ppo", [[0.0] * 3], "Pendulum-v1", **TINY)[1] is None
-    assert figures_of("ppo_lstm", [0], **lstm)[1] is None
-
-
 CORRIDOR, TIGER = "ShortCorridor-v0", "Tiger-v0"
 BEST_OF_CORRIDOR = -(6 + 4 * np.sqrt(2))
 SHORT = {"n_steps": 16, "batch_size": 16}
@@ -341,18 +302,6 @@ def test_agents_without_memory_are_measured_by_the_best_of_their_kind():
     assert figures["measured_by"] == "observation"
     # Without a limit, p = 1/2 takes (4 - 1) / (1/4) steps; of 1000 the rest is nothing.
     assert yardstick.baseline == pytest.approx(-12)
-
-
-def test_figures_are_put_on_the_scale_of_memory_and_only_where_that_differs():
-    figures = {"mean_return": -11.0, **yardstick_of("qlearning", CORRIDOR).figures(-11.0)}
-    wider = with_memory(figures)
-    assert (wider["optimum"], wider["measured_by"]) == (-3, "memory")
-    assert wider["score"] == pytest.approx(1 / 9)
-    assert wider["gap"] == pytest.approx(8)
-    assert with_memory(wider) == wider
-    plain = {"mean_return": 0.5, **yardstick_of("qlearning", LAKE).figures(0.5)}
-    assert with_memory(plain) is plain
-    assert "full_optimum" not in plain
 
 
 @pytest.mark.parametrize(

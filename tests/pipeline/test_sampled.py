@@ -80,19 +80,6 @@ def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_strea
     assert not tuned & judged
 
 
-def test_successes_are_counted_where_the_environment_tells_them():
-    env_kwargs = {"slip": 0.3, "shelf_reward": -1, "max_episode_steps": 40}
-    model = agent_of("qlearning", "Warehouse-v0", learning_rate=0.3).learn(60_000)
-    env = make_vec_env("Warehouse-v0", 4, env_kwargs=env_kwargs)
-    evaluation = evaluate(model, env, 200, seed=0)
-    # Each move costs 1, and the last one brings 100 if it succeeds.
-    failed = evaluation.returns == -evaluation.lengths
-    np.testing.assert_array_equal(evaluation.successes, ~failed)
-    np.testing.assert_array_equal(evaluation.returns[~failed], 101.0 - evaluation.lengths[~failed])
-    assert (evaluation.lengths[failed] == 40).all()
-    assert 0.05 < evaluation.success_rate == evaluation.successes.mean() < 0.95
-
-
 NORMALIZED = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 32, "batch_size": 32}
 NORMALIZED |= {"n_epochs": 2, "n_envs": 2, "normalize": True}
 
@@ -173,20 +160,6 @@ def test_evaluations_are_left_out_while_they_are_too_dear(steady, tmp_path, monk
     with np.load(run.path / "evaluations.npz") as evaluations:
         assert evaluations["timesteps"].tolist() == [750, 1500]
         assert evaluations["results"].shape == (2, 5)
-
-
-def test_a_run_says_what_its_evaluations_took(tmp_path):
-    entry = {"n_steps": 50, "batch_size": 50, "n_epochs": 1}
-    run, outcome = trained("ppo", CART, entry, folder=tmp_path, n_timesteps=500)
-    info = run.recorded()
-    assert info["evaluation_steps"] == outcome.evaluation_steps > 0
-    evaluations = np.load(run.path / "evaluations.npz")
-    final, n_columns = info["final"], evaluations["results"].shape[1]
-    counts = np.array(evaluations.get("n_episodes", [n_columns] * len(evaluations["timesteps"])))
-    during = (evaluations["ep_lengths"].mean(axis=1) * counts).sum()
-    assert outcome.evaluation_steps == during + final["mean_length"] * final["n_episodes"]
-    assert info["best_episodes"] in counts
-    assert outcome.evaluating.cpu_seconds > 0
 
 
 POLE = Yardstick(optimum=500.0, baseline=20.0, at_least=480.0)

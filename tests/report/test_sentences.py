@@ -23,8 +23,8 @@ from rl_yardstick.report.page import render, result_sections
 from rl_yardstick.report.page.frame import Report
 from rl_yardstick.report.series import EnvironmentSeries, StudySeries, agent_marks, run_series
 from rl_yardstick.report.terminal import print_analysis
-from rl_yardstick.report.words import conclusion, pairs_both_ways, unseen_sentence
-from rl_yardstick.verdicts import Best, ThresholdSummary, judge
+from rl_yardstick.report.words import conclusion, pairs_both_ways
+from rl_yardstick.verdicts import Best, judge
 from tests.report import made_up
 from tests.report.test_page import Page
 
@@ -95,21 +95,6 @@ def test_pairs_with_one_word_stand_in_one_sentence_of_the_better_agent(words, ch
     assert said(place_of(words, **changes)).pairs == tuple(sentences)
 
 
-def test_how_soon_agents_arrive():
-    stays = {"slow": (0.75, 3000.0), "quick": (1.0, 1000.0), "late": (0.25, INF), "never": (0, INF)}
-    agents = []
-    for name, (share, steps) in stays.items():
-        found = ThresholdSummary(made_up.estimate(steps, n=4), made_up.estimate(share, n=4))
-        agents.append(made_up.agent(name, 90.0 - len(agents), steps_to_stay=found))
-    assert said(made_up.environment(agents)).notes == (
-        (
-            "quick stays above a score of 0.95 in 4 of 4 runs, in the median run from step 1,000; "
-            "slow in 3 of 4 runs, in the median run from step 3,000; late in 1 of 4 runs; never in "
-            "none."
-        ),
-    )
-
-
 @pytest.mark.parametrize(
     ("changes", "notes"),
     [
@@ -130,14 +115,6 @@ def test_what_else_is_said(changes, notes):
     for agents, first in ((place.agents, []), ((failing,), ["3 of 20 runs of a failed."])):
         told = said(replace(place, agents=(*agents, *place.agents[1:])[:2])).notes
         assert list(told) == [*first, *notes]
-
-
-def test_once_a_page_it_is_said_what_so_few_runs_cannot_show():
-    few = made_up.analysis([place_of({}, TWO)], ["a", "b"])
-    assert unseen_sentence(few) == (
-        "A failure that no run showed is not counted: with 4 runs up to 53 % of further runs "
-        "could fail."
-    )
 
 
 def study_of(runs, root=None):

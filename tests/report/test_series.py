@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,7 +14,6 @@ from rl_yardstick.experiments.bandits import pull_statistics
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.report.series import (
     auer_bound,
-    best_expected_reward,
     best_of_normals,
     grids,
     lai_robbins_slope,
@@ -161,22 +159,6 @@ def test_best_of_normals():
     by_hand = [0, 1 / math.sqrt(math.pi), 1.5 / math.sqrt(math.pi)]
     assert [best_of_normals(n) for n in (1, 2, 3)] == pytest.approx(by_hand, abs=1e-9)
     assert best_of_normals(10) == pytest.approx(1.5388, abs=5e-5)
-
-
-@pytest.mark.parametrize(
-    ("env_id", "kwargs", "expected"),
-    [
-        ("SegmentBandit-v0", {}, 0.3 * 0.25 + 0.7 * 0.12),
-        ("GaussianBandit-v0", {"mean_loc": 4.0, "n_arms": 2}, 4 + 1 / math.sqrt(math.pi)),
-        ("GaussianBandit-v0", {"means": [0.0, 0.0], "drift_std": 0.1}, None),
-    ],
-)
-def test_best_expected_reward(env_id, kwargs, expected):
-    env = gym.make(env_id, **kwargs)
-    env.reset(seed=0)
-    best = best_expected_reward(env)
-    env.close()
-    assert best == (None if expected is None else pytest.approx(expected))
 
 
 @pytest.fixture(scope="module")

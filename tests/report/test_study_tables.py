@@ -185,26 +185,6 @@ def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
         assert (cell.text, cell.value, cell.note, cell.aside) == ("-", None, "", ""), title
 
 
-def test_returns_beside_that_of_the_greedy_policy_stand_below_the_ranking():
-    explores = {"stochastic": made_up.estimate(70.0), "acts_by": "epsilon 0.1"}
-    discounts = {"discount": 0.9, "discounted": made_up.estimate(30.0), "discounted_optimum": 34.5}
-    agents = [
-        made_up.agent("both", 90.0, **explores, **discounts),
-        made_up.agent("plans", 80.0, discount=0.5),
-        made_up.agent("plain", 40.0),
-    ]
-    table = tables_of(agents)["others"]
-    assert [column.page for column in table["columns"]] == ["Greedy", "Stochastic", "Discounted"]
-    shown = [[f"{cell.text} {cell.note}".strip() for cell in cells] for _, cells in table["rows"]]
-    assert shown == [
-        ["93 92.9 to 93.2", "70 69.9 to 70.2; epsilon 0.1",
-         "30 29.9 to 30.2; by 0.9; optimum 34.5"],
-        ["83 82.9 to 83.2", "unknown", "unknown"],
-        ["43 42.9 to 43.2", "unknown", "-"],
-    ]  # fmt: skip
-    assert tables_of(agents[1:])["others"] is None
-
-
 LONG_NAMES = ["double_expected_sarsa_with_a_long_name", "an agent of many short words here", "x"]
 LARGE = -12_345_678.0
 
