@@ -38,19 +38,6 @@ def solved(policy, discount=DISCOUNT):
     return np.linalg.solve(np.eye(16) - discount * matrix, rewards)
 
 
-def q_target(reward, discount, terminated, next_values):
-    return reward if terminated else reward + discount * next_values.max()
-
-
-def sarsa_target(reward, discount, terminated, next_values, next_action):
-    return reward if terminated else reward + discount * next_values[next_action]
-
-
-def expected_target(reward, discount, terminated, next_values, epsilon):
-    mean = epsilon * next_values.mean() + (1 - epsilon) * next_values.max()
-    return reward if terminated else reward + discount * mean
-
-
 def divergence(p, q):
     return special.rel_entr(p, q) + special.rel_entr(1 - p, 1 - q)
 
@@ -85,10 +72,6 @@ def lambda_means(values, decay, n=200):
     return means
 
 
-def targets(rewards, terminated, values, discount):
-    return rewards + discount * ~terminated * values.max(axis=1)
-
-
 def doubled(choosing, judging):
     """Targets that choose by one array of values and judge by another: online 0, lagging 1."""
 
@@ -98,15 +81,6 @@ def doubled(choosing, judging):
         return rewards + discount * ~terminated * values
 
     return told
-
-
-def huber(error):
-    return error**2 / 2 if abs(error) < 1 else abs(error) - 0.5
-
-
-def gain(ratio, advantage, epsilon):
-    bounded = min(max(ratio, 1 - epsilon), 1 + epsilon)
-    return min(ratio * advantage, bounded * advantage)
 
 
 def ahead(values, discount=DISCOUNT, **more):
@@ -200,7 +174,7 @@ CASES = {
         (lambda trace, s, d, k: d * k * trace + np.eye(len(trace))[s], "That is the accumulating"),
     ],
     networks.check_targets: [
-        (targets, "Right."),
+        (lambda r, t, v, d: r + d * ~t * v.max(axis=1), "Right."),
         (lambda r, t, v, d: (r + d * v.T).T, "The shape has to be (12,), one target for each step"),
         (lambda r, t, v, d: r + d * v.max(axis=1), "When the episode has terminated nothing"),
     ],
@@ -209,7 +183,7 @@ CASES = {
         (doubled(1, 0), "The roles are the wrong way round"),
     ],
     networks.check_loss: [
-        (huber, "Right."),
+        (lambda e: e**2 / 2 if abs(e) < 1 else abs(e) - 0.5, "Right."),
         (lambda e: e**2 / 2 if e < 1 else e - 0.5, "An error above and one below"),
         (lambda e: e**2 / 2, "Beyond 1 it has to be a straight line"),
     ],
@@ -219,7 +193,7 @@ CASES = {
         (lambda x, top, low: (x - low) / top, "The optimum has to have the sc"),
     ],
     figures.check_gain: [
-        (gain, "Right."),
+        (lambda r, a, e: min(r * a, np.clip(r, 1 - e, 1 + e) * a), "Right."),
         (lambda r, a, e: np.clip(r, 1 - e, 1 + e) * a, "A good action that has become much less"),
     ],
     figures.check_unseen: [
@@ -285,16 +259,21 @@ CASES = {
         ((0, 0.2), "Another setting has the higher mean"),
     ],
     (lambda answer: checker.check_target(answer, "qlearning")): [
-        (q_target, "Right."),
+        (lambda r, d, t, v: r if t else r + d * v.max(), "Right."),
         (lambda r, d, t, v: r + d * v.max(), "When the episode has terminated"),
         (lambda r, d, t, v: r if t else r + d * v.mean(), "If the best next value"),
     ],
     (lambda answer: checker.check_target(answer, "sarsa")): [
-        (sarsa_target, "Right."),
+        (lambda r, d, t, v, next_action: r if t else r + d * v[next_action], "Right."),
         (lambda r, d, t, v, next_action: r if t else r + d * v.max(), "The target has to follow"),
     ],
     (lambda answer: checker.check_target(answer, "expected_sarsa")): [
-        (expected_target, "Right."),
+        (
+            lambda r, d, t, v, epsilon: (
+                r if t else r + d * (epsilon * v.mean() + (1 - epsilon) * v.max())
+            ),
+            "Right.",
+        ),
         (lambda r, d, t, v, epsilon: r if t else r + d * v.mean(), "With epsilon 0 the policy"),
     ],
     (lambda answer: checker.check_regret([0.2, 0.9, 0.5], [0, 1, 2, 0, 1], answer)): [

@@ -33,12 +33,6 @@ def pulls_in(folder):
         return dict(file)
 
 
-# Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
-ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
-REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
-REGRETS = np.where(ARMS == 0, 0.3, 0.0)
-
-
 def test_every_figure_at_every_point_the_plain_way():
     """Three runs of so many pulls that the points thin out."""
     by_cell = np.array([[0, 8, 2], [4, 0, 1]])  # the regret of each arm in each of two contexts
@@ -71,17 +65,6 @@ def test_every_figure_at_every_point_the_plain_way():
     for context in range(2):
         counts = np.bincount(arms[contexts == context], minlength=3)
         assert found.shares[context] == pytest.approx(counts / counts.sum())
-
-
-def test_statistics_are_read_as_they_were_written(tmp_path):
-    given = {"moments": (1, 3), "posteriors": np.arange(16.0).reshape(2, 2, 1, 2, 2)}
-    given["true_means"] = np.array([[0.1, 0.2]])
-    written = pull_statistics(ARMS, REWARDS, REGRETS, None, 2, **given)
-    written.save(tmp_path / "statistics.npz")
-    read = PullStatistics.load(tmp_path / "statistics.npz")
-    for name, value in vars(written).items():
-        np.testing.assert_array_equal(getattr(read, name), value, strict=True)
-    assert read.posteriors.tolist() == given["posteriors"][0].tolist()  # of the first run alone
 
 
 SEGMENTS = EnvironmentSpec("segments", "SegmentBandit-v0", {"n_timesteps": 200})

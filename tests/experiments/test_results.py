@@ -255,11 +255,11 @@ def test_failures_do_not_stop_the_analysis(tmp_path, case):
         if evaluations is not None and run.environment == places[0].label:
             write_run(run, evaluations, episodes=())
     results = read_results(study, planned, tmp_path)
-    if not len(results.summary):
-        assert analyse(results).environments == ()
-        return
     analysis = analyse(results)
     assert analysis.overall is None
+    if not len(results.summary):
+        assert analysis.environments == ()
+        return
     assert set(results.summary["n_episodes"]) == {0}
     with (tmp_path / "out").open("w") as file:
         console = TextConsole(record=True, width=300, quiet=False, file=file)

@@ -212,16 +212,6 @@ def test_every_agent_on_every_environment_with_every_seed(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_labels_that_would_share_a_folder():
-    for labels in (("a b", "a/b"), ("Mine", "mine"), ("same", "same")):
-        agents = [AgentSpec(label, "qlearning") for label in labels]
-        with pytest.raises(UserError, match=r"agents: .* would share the folder"):
-            plan(study_of(*agents), NOWHERE)
-        environments = [replace(LAKE, label=label) for label in labels]
-        with pytest.raises(UserError, match=r"environments: .* would share the folder"):
-            plan(study_of("sarsa", environments=environments), NOWHERE)
-
-
 def test_the_agents_settings_go_over_the_environments_and_those_over_the_file():
     usual = {"gamma": 0.5, "learning_rate": 0.5, "env_kwargs": {"is_slippery": False}}
     own = {"learning_rate": 0.25, "n_episodes": 7, "env_kwargs": {"map_name": "8x8"}}

@@ -233,22 +233,6 @@ def test_cosine_and_signal_to_noise_of_multiples_of_the_exact_gradient(corridor_
         assert found["gradient_snr"] == pytest.approx(ratio, rel=1e-3)
 
 
-def test_a_state_without_advantages_counts_by_what_was_estimated_there(corridor_registered):
-    """Met once, or twice with half of it each time: the sum is the same."""
-    _, _, recorder = on_corridor(corridor_registered)
-    true = np.random.default_rng(0).normal(size=(5, 2)) / 10
-    true[4] = 0
-    found = []
-    for times in (1, 2):
-        states = np.append(np.repeat(np.arange(4), 2), [4] * times)
-        actions = np.append(np.tile([0, 1], 4), [0] * times)
-        estimates = np.append(true[:4].reshape(-1), [0.2 / times] * times) * len(states)
-        batch = np.arange(len(states)), estimates
-        found.append(recorder.gradient_figures(true, states, actions, [batch]))
-    assert found[0] == pytest.approx(found[1], rel=1e-6)
-    assert found[0]["gradient_cosine"] < 0.99
-
-
 @pytest.mark.parametrize(
     ("algo", "settings", "eval_freq", "column"),
     [

@@ -317,16 +317,6 @@ def test_where_nothing_is_lost_by_observing_the_scale_stays(env_id, entry):
     assert evaluator.scale is evaluator.yardstick.hidden is None
 
 
-def test_no_discounted_optimum_is_told_where_observations_hide_the_state():
-    """To listen for all ten steps; whoever sees the state earns 95.62."""
-    evaluator = exact_evaluator(spec_for("qlearning", TIGER))
-    assert evaluator.scale.note is None
-    agent = load_algorithm("qlearning")(env=TIGER, gamma=0.99, tie_breaking="first")
-    found = evaluator.other_returns(agent)
-    assert found.discounted_return == pytest.approx(-(1 - 0.99**10) / 0.01)
-    assert found.discounted_optimum is None
-
-
 class Counting:
     """Counts readings of the tiger, and opens a door at a difference of two."""
 

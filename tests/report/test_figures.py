@@ -1,6 +1,5 @@
 """What figures show, asked of Matplotlib's axes: numbers, colours, words; and nothing is cut."""
 
-from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -10,11 +9,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection, QuadMesh
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FixedLocator, PercentFormatter
 
 from rl_yardstick.experiments.analysis import OverallAnalysis
-from rl_yardstick.report.figures import draw_learning_curves, write_figures
+from rl_yardstick.report.figures import write_figures
 from rl_yardstick.report.series import (
     COLOURS,
     AgentRuns,
@@ -24,7 +22,6 @@ from rl_yardstick.report.series import (
     EnvironmentSeries,
     Grid,
     LearningCurves,
-    Mark,
     PullSeries,
     RegretBounds,
     StudySeries,
@@ -324,25 +321,3 @@ def test_nothing_is_cut_by_matplotlibs_own_extents(drawn, tmp_path):
         for axes in shown:
             assert axes.bbox.width > 1.2 * inch, path.name
             assert axes.bbox.height > 0.8 * inch, path.name
-
-
-MARKS = {"first": Mark("first", 1, "dash"), "second": Mark("second", 0, "solid")}
-
-
-def test_what_stands_beside_curves():
-    place = made_up.environment(optimum_at_least=90.0, optimum_is_proven=False)
-    (left, right), names = Figure().subplots(1, 2), ["first", "second"]
-    found = curves_of(names, 79.0, names)
-    found["evaluation"] = replace(found["evaluation"], budget="episode")
-    draw_learning_curves((left, right), EnvironmentSeries(place, found, (), None, {}), MARKS)
-    assert left.get_yscale() != right.get_yscale()
-    *lines, legend = described(left.figure)
-    assert legend == (
-        "names first, second, optimum, at most (not proven), optimum, at least, best random or "
-        "constant policy, trained on a variant of the environment, 95 % interval"
-    )
-    assert lines[0] == "lake: evaluations | episodes | return (log scale beyond ±79)"
-    title = "training episodes (2 agents: on a variant of the environment)"
-    assert f"{title} | episodes | return" in lines
-    ticks = [tick for tick in left.get_yticks() if abs(tick) < 2000]
-    assert ticks == [-1000, -300, -100, -50, 0, 50, 100, 300, 1000]

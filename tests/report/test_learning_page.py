@@ -51,25 +51,6 @@ def test_the_data_are_what_was_recorded_to_the_last_digit(watched, page_of):
     assert (data["n_states"], len(data["actions"]), data["is_cut"]) == (6, 4, False)
 
 
-def test_without_a_table_the_policy_in_every_state(watched, page_of):
-    spec, watch = watched("FrozenLake-v1", "value_iteration", {"n_timesteps": 128})
-    data, text = page_of(spec, watch)
-    assert (data["kind"], data["unit"], data["stride"]) == ("maps", "evaluation", 1)
-    assert "from evaluation to evaluation" in text
-    rows, moments = watch.moments.rows, data["moments"]
-    assert moments["timesteps"] == rows["timesteps"].tolist()
-    assert moments["timesteps"][0] == 0
-    assert moments["actions"][-1] == rows["actions"][-1].tolist()
-    assert moments["return"][-1] == rows["values"][-1][0] > 0.5
-    assert set(moments["loss"]) == {None}
-    # Where an episode has ended nothing is done.
-    reachable = watch.evaluator.model.reachable.tolist()
-    assert [value is not None for value in moments["values"][0]] == reachable
-    # The beginning and the end are there without evaluations.
-    unseen = watched("FrozenLake-v1", "value_iteration", {"n_timesteps": 64}, eval_freq=-1)
-    assert page_of(*unseen)[0]["moments"]["timesteps"] == [0, 64]
-
-
 def test_a_page_is_no_larger_than_three_megabytes(watched, page_of, monkeypatch):
     training = watched("Warehouse-v0", "qlearning", {"n_timesteps": 800})
     _, text = page_of(*training)

@@ -5,18 +5,16 @@ import math
 import re
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from rl_yardstick.commands.terminal import TextConsole
-from rl_yardstick.experiments.off_policy import Comparison, Judged, PolicyTerms
 from rl_yardstick.report import documents
 from rl_yardstick.report.documents import MARKUPS, headline, ranking, table_as
 from rl_yardstick.report.page import result_sections
 from rl_yardstick.report.page.frame import Report
 from rl_yardstick.report.ranking import COLUMNS, Row
 from rl_yardstick.report.series import StudySeries
-from rl_yardstick.report.terminal import print_analysis, print_comparison
+from rl_yardstick.report.terminal import print_analysis
 from rl_yardstick.report.words import conclusion
 from rl_yardstick.verdicts import Best, Estimate, ThresholdSummary
 from tests.report import made_up
@@ -198,20 +196,6 @@ def agents_table(console):
     print_analysis(console, made_up.analysis([place], LONG_NAMES))
 
 
-def logged_table(console):
-    terms = np.array([12_345.0, 23_456.0])
-    rows = [
-        Judged(f"logs/{name}", PolicyTerms(*[k * terms] * 3, 1669.0 * k, terms, terms), k > 1)
-        for k, name in enumerate(LONG_NAMES, start=1)
-    ]
-
-    class Log:
-        source, n_arms = "log.csv", 2
-        __len__ = lambda _: 5000  # noqa: E731
-
-    print_comparison(console, Comparison(Log(), tuple(rows), ()))
-
-
 def printed(table, width, is_terminal):
     file = io.StringIO()
     table(TextConsole(file=file, width=width, force_terminal=is_terminal, color_system=None))
@@ -222,14 +206,13 @@ def numbers(text):
     return re.findall(r"[-+]?\d[\d,.]*", text.replace("\N{MINUS SIGN}", "-"))
 
 
-@pytest.mark.parametrize("table", [agents_table, logged_table])
-def test_no_digit_is_cut_and_no_column_missed_at_any_width(table):
-    whole = printed(table, 400, False)
+def test_no_digit_is_cut_and_no_column_missed_at_any_width():
+    whole = printed(agents_table, 400, False)
     headings = {part.strip() for part in re.split("[┃│\n]", whole) if part.strip()}
-    headings = headings & {"IPS", "self-normalised", "effective", "IQM", "reward", "mean"}
+    headings = headings & {"IQM", "mean"}
     for width in (40, 60, 72, 80):
         for is_terminal in (False, True):
-            shown = printed(table, width, is_terminal)
+            shown = printed(agents_table, width, is_terminal)
             assert set(numbers(shown)) <= set(numbers(whole)), (width, is_terminal)
             assert all(re.search(rf"\b{each}\b", shown) for each in headings)
             rows = [line for line in shown.splitlines() if line[:1] in "┃│┏└"]
