@@ -26,8 +26,8 @@ os.environ.update(OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
 import numpy as np
 from numpy.typing import NDArray
 
+from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.commands.train import build_parser, spec_from_flags
-from rl_yardstick.experiments.plan import NETWORKS
 from rl_yardstick.pipeline.environments import make_evaluation_env
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.sampled import SampledEvaluator
@@ -65,10 +65,10 @@ ENTRIES = {
 def scores_of(env_id: str, algo: str, n_steps: int, most: int) -> NDArray[np.float32]:
     """The scores of an entry, in the order of seeds."""
     typed = f"--env {env_id} --algo {algo} -n {n_steps} --seed 0 --eval-episodes 100".split()
-    if algo in NETWORKS:
+    if ALGORITHMS[algo].family == "library":
         typed += ["--engine", "compiled", "--device", "cpu"]
     first = spec_from_flags(build_parser().parse_args(typed))
-    n_runs = N_NETWORKS if algo in NETWORKS else FEWER.get(env_id, N_RUNS)
+    n_runs = N_NETWORKS if ALGORITHMS[algo].family == "library" else FEWER.get(env_id, N_RUNS)
     eval_env, exact = make_evaluation_env(first, first.n_eval_envs), exact_evaluator(first)
     scores: list[float] = []
     for seed in range(min(n_runs, most)):

@@ -7,8 +7,8 @@ import os
 import signal
 import sys
 import tempfile
-from contextlib import contextmanager
-from functools import cache
+from concurrent.futures import Future
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -79,23 +79,6 @@ def signals_are_left_as_they_were():
     assert after == before
 
 
-@pytest.fixture
-def small_disk():
-    """Within the ``with`` statement no file may have more bytes than so many."""
-    resource = pytest.importorskip("resource")
-
-    @contextmanager
-    def limited(n_bytes):
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-    return limited
-
-
 HOSTILE = "</script><script>document.title='taken'</script>"
 
 
@@ -133,33 +116,35 @@ def own_folder(monkeypatch, tmp_path):
     (tmp_path / "own").mkdir()
     folder = (tmp_path / "own").resolve()
     monkeypatch.chdir(folder)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), str(Path(__file__).parents[1])]))
     monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
     tables = [(table, dict(table)) for table in (ALGORITHMS, gym.registry, sys.modules)]
     yield folder
     for table, before in tables:
         for name in table.keys() - before.keys():
-            if table is not sys.modules or _is_of(table[name], tmp_path):
+            is_own = str(tmp_path) in str(getattr(table[name], "__file__", "") or "")
+            if table is not sys.modules or is_own:
                 del table[name]
 
 
-def _is_of(module, folder):
-    return str(folder) in str(getattr(module, "__file__", "") or "")
-
-
 @pytest.fixture
-def typed(monkeypatch, capsys):
-    """Run a command line in this process: exit code, output, errors."""
-    from rl_yardstick import commands
+def typed(capfd):
+    """Run a command line in this process: exit code, output, errors, its children's included."""
+    from rl_yardstick.commands import main, run_command
 
     def run(*words):
-        name = str(words[0]).removesuffix(".py")
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *(str(word) for word in words[1:])])
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
-        code = commands._exit_code(name)
+        name = Path(words[0]).name
+        command = main if name == "yardstick" else partial(run_command, name.removesuffix(".py"))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "path", [*sys.path])
+            patch.setattr(sys, "argv", [name, *map(str, words[1:])])
+            with pytest.raises(SystemExit) as stop:
+                command()
         for number, handler in handlers.items():  # the process would end with its command
             signal.signal(number, handler)
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
+        captured = capfd.readouterr()
+        return stop.value.code, captured.out, captured.err
 
     return run
 
@@ -168,6 +153,36 @@ def typed(monkeypatch, capsys):
 def type_in_own_folder(own_folder, typed):
     """As `typed`, inside a user's folder."""
     return typed
+
+
+def call(function, *args):
+    return function(*args)
+
+
+class Here:
+    """Stands where a pool of processes does, which would import all libraries once more."""
+
+    def __init__(self, n_workers):
+        self.stop = self.join = lambda: None
+
+    def submit(self, function, timeout, *args):
+        future = Future()
+        try:
+            future.set_result(function(*args))
+        except Exception as error:  # noqa: BLE001  # as a pool does
+            future.set_exception(error)
+        return future
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Studies whose runs are done by this process."""
+    for place in ("experiments.pool", "report.page.learning"):
+        monkeypatch.setattr(f"rl_yardstick.{place}.process_pool", Here)
+    for place in ("experiments.analysis", "report.page.world_sections"):
+        monkeypatch.setattr(
+            f"rl_yardstick.{place}.do_aside", lambda function, *args: function(*args)
+        )
 
 
 @pytest.fixture(scope="session")
@@ -210,7 +225,7 @@ def report_study(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(films, "MAX_STEPS", 20)  # longer films take ten seconds to draw
         # In this process, where that holds, also if there is one that runs are forked from.
-        patch.setattr(world_sections, "do_aside", lambda function, *args: function(*args))
+        patch.setattr(world_sections, "do_aside", call)
         write_report(Report(study_series(analysis), "python compare.py 'a & b.yml'"), page)
     return SimpleNamespace(
         study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page

@@ -22,7 +22,6 @@ from documented_commands import SEEDS, n_solved, outcome, prepared_folder  # noq
 
 from recommended_commands import (  # noqa: E402
     PAGE,
-    commands_in,
     reached,
     trainings,
     with_outcomes,
@@ -124,8 +123,6 @@ def test_the_example_of_a_study_is_one_and_every_key_is_documented(tmp_path):
     assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(_File.model_fields)
 
 
-# --- what the commands reach ----------------------------------------------------------------------
-
 # Those that take little processor time and always succeed; of each algorithm the first one.
 SECONDS = 0.25
 ROWS = reached()
@@ -152,25 +149,6 @@ def test_a_training_does_what_the_page_says(tmp_path, monkeypatch, training):
     monkeypatch.chdir(tmp_path)
     prepared_folder(tmp_path)
     assert n_solved(training, [outcome(training, SEEDS[0], tmp_path / "logs")]) == 1
-
-
-def test_the_collector_reads_commands_wherever_they_stand():
-    text = """
-    | row | `python train.py --env A-v0 --algo x --seed 3 -params gamma:0.9` | more |
-    ``make train ARGS="--env B-v0 --algo y --engine auto"`` and `make train`
-    python train.py --list
-    python compare.py --env A-v0 B-v0 --algos x y --seeds 5 --env-kwargs slip:0.1   # a comment
-    python tune.py --env A-v0 --algo x --trials 9
-    python compare.py studies/some.yml
-    """
-    found = [one for command in commands_in(text) for one in command.trainings]
-    assert found == [
-        "--env A-v0 --algo x -params gamma:0.9",
-        "--env B-v0 --algo y",
-        "--env Warehouse-v0 --algo ppo",
-        *(f"--env {e} --algo {a} --env-kwargs slip:0.1" for e in ("A-v0", "B-v0") for a in "xy"),
-        "--env A-v0 --algo x",
-    ]
 
 
 def test_the_headline_study_has_the_same_figures_wherever_it_stands():

@@ -52,9 +52,6 @@ def test_a_model_can_be_checked_as_written(own_folder, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("the environment's P is not what step does: state ")
 
 
-# --- the examples of CONTRIBUTING ----------------------------------------------------------------
-
-
 def contributed(title, entry):
     """A rule as CONTRIBUTING writes it, and its entry in the table of agents."""
     (text,) = re.findall(rf'```python\n("""{title}\."""\n.*?)```', CONTRIBUTING, re.DOTALL)

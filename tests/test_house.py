@@ -18,20 +18,7 @@ from rl_yardstick.machine_code.cache import COMPILED
 
 ROOT = Path(__file__).resolve().parent.parent
 HOUSE = ROOT / "rl_yardstick"
-PACKAGES = (
-    "safe_files",
-    "machine_code",
-    "mdp",
-    "verdicts",
-    "envs",
-    "agents",
-    "pipeline",
-    "diagnosis",
-    "experiments",
-    "tuning",
-    "report",
-    "commands",
-)
+PACKAGES = sorted(path.parent.name for path in HOUSE.glob("*/__init__.py"))
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 

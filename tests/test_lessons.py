@@ -38,23 +38,6 @@ def solved(policy, discount=DISCOUNT):
     return np.linalg.solve(np.eye(16) - discount * matrix, rewards)
 
 
-def q_target(reward, discount, terminated, next_values):
-    return reward if terminated else reward + discount * next_values.max()
-
-
-def sarsa_target(reward, discount, terminated, next_values, next_action):
-    return reward if terminated else reward + discount * next_values[next_action]
-
-
-def expected_target(reward, discount, terminated, next_values, epsilon):
-    mean = epsilon * next_values.mean() + (1 - epsilon) * next_values.max()
-    return reward if terminated else reward + discount * mean
-
-
-MEANS = [0.2, 0.9, 0.5]
-ARMS = [0, 1, 2, 0, 1]
-
-
 def divergence(p, q):
     return special.rel_entr(p, q) + special.rel_entr(1 - p, 1 - q)
 
@@ -81,99 +64,27 @@ def n_step_return(rewards, discount, value_after, *, first=0):
     return (kept * np.asarray(rewards)).sum() + discount**n * value_after
 
 
-def n_step_means(values, n):
-    """Means of the n-step returns."""
-    for _ in range(n):
-        values = traces.looked_ahead(WALK, 1.0, values)[:, 0]
-    return values
-
-
 def lambda_means(values, decay, n=200):
     means = np.zeros(21)
     for chance in (1 - decay) * decay ** np.arange(n):
-        values = n_step_means(values, 1)
+        values = traces.looked_ahead(WALK, 1.0, values)[:, 0]
         means += chance * values
     return means
 
 
-def replacing(trace, state, discount, decay):
-    trace = discount * decay * trace
-    trace[state] = 1
-    return trace
-
-
-def accumulating(trace, state, discount, decay):
-    trace = discount * decay * trace
-    trace[state] += 1
-    return trace
-
-
-def targets(rewards, terminated, values, discount):
-    return rewards + discount * ~terminated * values.max(axis=1)
-
-
 def doubled(choosing, judging):
-    """Targets that choose by one array of values and judge by another."""
+    """Targets that choose by one array of values and judge by another: online 0, lagging 1."""
 
     def told(rewards, terminated, online, lagging, discount):
-        chosen = choosing(online, lagging).argmax(axis=1)
-        values = judging(online, lagging)[np.arange(len(chosen)), chosen]
+        chosen = (online, lagging)[choosing].argmax(axis=1)
+        values = (online, lagging)[judging][np.arange(len(chosen)), chosen]
         return rewards + discount * ~terminated * values
 
     return told
 
 
-def online(first, second):
-    return first
-
-
-def lagging(first, second):
-    return second
-
-
-def huber(error):
-    return error**2 / 2 if abs(error) < 1 else abs(error) - 0.5
-
-
-def score(earned, optimum, baseline):
-    return (earned - baseline) / (optimum - baseline)
-
-
-def gain(ratio, advantage, epsilon):
-    bounded = min(max(ratio, 1 - epsilon), 1 + epsilon)
-    return min(ratio * advantage, bounded * advantage)
-
-
-def policy_values(answer):
-    return checker.check_policy_values(MODEL, RANDOM, DISCOUNT, answer)
-
-
-def follows_the_best(answer):
-    return checker.check_target(answer, "qlearning")
-
-
-def follows_the_next(answer):
-    return checker.check_target(answer, "sarsa")
-
-
-def follows_the_mean(answer):
-    return checker.check_target(answer, "expected_sarsa")
-
-
-def regrets(answer):
-    return checker.check_regret(MEANS, ARMS, answer)
-
-
 def ahead(values, discount=DISCOUNT, **more):
     return checker.looked_ahead(MODEL, discount, values, **more)
-
-
-def q_values(answer):
-    return checker.check_action_values(MODEL, DISCOUNT, answer)
-
-
-def improvable_states(answer):
-    return checker.check_improvable(MODEL, DISCOUNT, solved(RANDOM), answer)
 
 
 SLIPPERY = transition_model(gym.make("Warehouse-v0", slip=0.1, shelf_reward=-5))
@@ -183,18 +94,6 @@ def moves(values, discount, **more):
     return checker.looked_ahead(SLIPPERY, discount, values, **more)
 
 
-def greedy_policies(answer):
-    return checker.check_greedy(SLIPPERY, answer)
-
-
-def thresholds(answer):
-    return checker.check_threshold(SLIPPERY, 90, answer)
-
-
-def sweeps(answer):
-    return checker.check_sweep(MODEL, DISCOUNT, answer)
-
-
 def swept(values, order):
     for state in order:
         values[state] = ahead(values)[state].max()
@@ -202,10 +101,6 @@ def swept(values, order):
 
 
 CLIFF = transition_model(gym.make("CliffWalking-v1"))
-
-
-def ways(answer):
-    return checker.check_ways(CLIFF, answer)
 
 
 def table_of(epsilon):
@@ -225,15 +120,7 @@ def optimist(n, e):
     return right**n - 0.01 / n * (on_the_way + off)
 
 
-def choices(answer):
-    search = np.array([[0.1, 0.3], [0.5, 0.7], [0.2, 0.2]])
-    return figures.check_choice(search, answer[0], [0.4, 0.5, 0.3], answer[1])
-
-
-def means_of_returns(answer):
-    return traces.check_lambda_targets(WALK, 0.8, ZEROS, answer)
-
-
+SEARCHED = np.array([[0.1, 0.3], [0.5, 0.7], [0.2, 0.2]])
 # What each check says of an answer.
 CASES = {
     checker.check_index: [
@@ -283,30 +170,30 @@ CASES = {
         (lambda r, d, v: n_step_return(r, d, v, first=1), "With 3 steps: the first reward is disc"),
     ],
     traces.check_replacing_trace: [
-        (replacing, "Right."),
-        (accumulating, "That is the accumulating trace"),
+        (lambda trace, s, d, k: np.where(np.arange(len(trace)) == s, 1, d * k * trace), "Right."),
+        (lambda trace, s, d, k: d * k * trace + np.eye(len(trace))[s], "That is the accumulating"),
     ],
     networks.check_targets: [
-        (targets, "Right."),
+        (lambda r, t, v, d: r + d * ~t * v.max(axis=1), "Right."),
         (lambda r, t, v, d: (r + d * v.T).T, "The shape has to be (12,), one target for each step"),
         (lambda r, t, v, d: r + d * v.max(axis=1), "When the episode has terminated nothing"),
     ],
     networks.check_double_targets: [
-        (doubled(online, lagging), "Right."),
-        (doubled(lagging, online), "The roles are the wrong way round"),
+        (doubled(0, 1), "Right."),
+        (doubled(1, 0), "The roles are the wrong way round"),
     ],
     networks.check_loss: [
-        (huber, "Right."),
+        (lambda e: e**2 / 2 if abs(e) < 1 else abs(e) - 0.5, "Right."),
         (lambda e: e**2 / 2 if e < 1 else e - 0.5, "An error above and one below"),
         (lambda e: e**2 / 2, "Beyond 1 it has to be a straight line"),
     ],
     figures.check_score: [
-        (score, "Right."),
+        (lambda x, top, low: (x - low) / (top - low), "Right."),
         (lambda x, top, low: top - x, "The optimum has the score 0"),
         (lambda x, top, low: (x - low) / top, "The optimum has to have the sc"),
     ],
     figures.check_gain: [
-        (gain, "Right."),
+        (lambda r, a, e: min(r * a, np.clip(r, 1 - e, 1 + e) * a), "Right."),
         (lambda r, a, e: np.clip(r, 1 - e, 1 + e) * a, "A good action that has become much less"),
     ],
     figures.check_unseen: [
@@ -315,12 +202,12 @@ CASES = {
         (lambda n: 0.05 ** (1 / n), "That is the share of runs that do not fail."),
         (lambda n: 1 / n, "With yours, 10 runs show no failure with a probability of 0.35."),
     ],
-    policy_values: [
+    (lambda answer: checker.check_policy_values(MODEL, RANDOM, DISCOUNT, answer)): [
         (np.ones(15), "The shape has to be (16,), one value for each state; it is (15,)."),
         (value_iteration(MODEL, DISCOUNT).values, "They are those of an agent that always takes"),
         (solved(RANDOM, discount=1 - 1e-12), "The discount is missing"),
     ],
-    q_values: [
+    (lambda answer: checker.check_action_values(MODEL, DISCOUNT, answer)): [
         (ahead, "Right."),
         (lambda v: ahead(v).tolist(), "Right."),
         (lambda v: ..., "Not done yet"),
@@ -333,7 +220,7 @@ CASES = {
         ),
         (lambda v: ahead(v).max(axis=1), "The shape has to be (16, 4)"),
     ],
-    greedy_policies: [
+    (lambda answer: checker.check_greedy(SLIPPERY, answer)): [
         (lambda v, d: moves(v, d).argmax(axis=1), "Right."),
         (lambda v, d: [row.argmax() for row in moves(v, d)], "Right."),
         (lambda v, d: moves(v, 0.9).argmax(axis=1), "It is greedy for another discount"),
@@ -342,56 +229,61 @@ CASES = {
         (lambda v, d: moves(v, d).argmin(axis=1), "61 states have a better action"),
         (lambda v, d: moves(v, d).max(axis=1), "Actions are the numbers 0 to 3."),
     ],
-    improvable_states: [
+    (lambda answer: checker.check_improvable(MODEL, DISCOUNT, solved(RANDOM), answer)): [
         ([14, 0, 1, 2, 3, 4, 6, 8, 9, 10, 13], "Right."),
         ([14, 10, 13], "8 states are missing."),
         ([15], "In some of these states no episode goes on"),
     ],
-    sweeps: [
+    (lambda answer: checker.check_sweep(MODEL, DISCOUNT, answer)): [
         (swept, "Right."),
         (lambda v, order: ahead(v).max(axis=1), "Each state sees old values only."),
         (lambda v, order: swept(v, range(16)), "It goes from first to last"),
         (lambda v, order: swept(v, order[::-1]), "A new value is not the best"),
     ],
-    thresholds: [
+    (lambda answer: checker.check_threshold(SLIPPERY, 90, answer)): [
         (0.77, "Right."),
         (0.75, "A little above it, the best robot still never"),
         (0.8, "A little below it, the goal is still worth the way."),
         (77, "A discount lies between 0 and 1."),
     ],
-    ways: [
+    (lambda answer: checker.check_ways(CLIFF, answer)): [
         ([table_of(0.0)] * 5, "Right."),
         ([table_of(0.0)] * 4 + [table_of(0.1)], "On 1 of 5 seeds the way is longer"),
         (np.zeros((5, 48, 4)), "On seed 0 the greedy policy never arrives."),
         ([table_of(0.0)], "One table may be luck"),
     ],
-    choices: [
+    (lambda answer: figures.check_choice(SEARCHED, answer[0], [0.4, 0.5, 0.3], answer[1])): [
         ((1, 0.2), "Right."),
         ((1, -0.2), "The sign is wrong"),
         ((1, 0.3), "It is not the mean in the search less"),
         ((0, 0.2), "Another setting has the higher mean"),
     ],
-    follows_the_best: [
-        (q_target, "Right."),
+    (lambda answer: checker.check_target(answer, "qlearning")): [
+        (lambda r, d, t, v: r if t else r + d * v.max(), "Right."),
         (lambda r, d, t, v: r + d * v.max(), "When the episode has terminated"),
         (lambda r, d, t, v: r if t else r + d * v.mean(), "If the best next value"),
     ],
-    follows_the_next: [
-        (sarsa_target, "Right."),
+    (lambda answer: checker.check_target(answer, "sarsa")): [
+        (lambda r, d, t, v, next_action: r if t else r + d * v[next_action], "Right."),
         (lambda r, d, t, v, next_action: r if t else r + d * v.max(), "The target has to follow"),
     ],
-    follows_the_mean: [
-        (expected_target, "Right."),
+    (lambda answer: checker.check_target(answer, "expected_sarsa")): [
+        (
+            lambda r, d, t, v, epsilon: (
+                r if t else r + d * (epsilon * v.mean() + (1 - epsilon) * v.max())
+            ),
+            "Right.",
+        ),
         (lambda r, d, t, v, epsilon: r if t else r + d * v.mean(), "With epsilon 0 the policy"),
     ],
-    regrets: [
+    (lambda answer: checker.check_regret([0.2, 0.9, 0.5], [0, 1, 2, 0, 1], answer)): [
         (np.cumsum([0.7, 0.0, 0.4, 0.7, 0.0]), "Right."),
         ([0.7, 0.0, 0.4, 0.7, 0.0], "Regret never falls, but yours does at pull 2."),
         (np.cumsum([0.2, 0.0, 0.4, 0.2, 0.0]), "A pull of arm 0 adds the wrong amount"),
     ],
-    means_of_returns: [
+    (lambda answer: traces.check_lambda_targets(WALK, 0.8, ZEROS, answer)): [
         (..., "Not done yet."),
-        (n_step_means(ZEROS, 1), "They look one step ahead only"),
+        (traces.looked_ahead(WALK, 1.0, ZEROS)[:, 0], "They look one step ahead only"),
     ],
 }
 
@@ -399,8 +291,8 @@ CASES = {
 @pytest.mark.parametrize(
     ("check", "answer", "said"),
     [
-        pytest.param(check, answer, said, id=f"{check.__name__} {place}: {said}")
-        for check, rows in CASES.items()
+        pytest.param(check, answer, said, id=f"{number} {place}: {said}")
+        for number, (check, rows) in enumerate(CASES.items())
         for place, (answer, said) in enumerate(rows)
     ],
 )

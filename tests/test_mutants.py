@@ -1,74 +1,10 @@
-"""The tool that makes deliberate errors, on a package so small that all is known of it."""
+"""Which deliberate errors the tool of `tests/mutation` makes of a line."""
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 TOOL = Path(__file__).parent / "mutation"
-SOURCE = '''"""Made up."""
-
-
-def clip(value: int, low: int, high: int) -> int:
-    """Not an error: the 1 of a docstring."""
-    if value > high:
-        return high
-    return max(value, low)
-
-
-def unused(value):
-    return value
-'''
-TESTS = """from toy.a import clip
-
-
-def test_clip():
-    assert [clip(value, 1, 3) for value in (0, 1, 2, 3, 4)] == [1, 1, 2, 3, 3]
-
-
-def test_broken():
-    assert False
-"""
-
-
-def test_which_errors_are_caught(tmp_path):
-    source, tests, record = (
-        tmp_path / name for name in ("toy/a.py", "tests/toy/test_a.py", "record")
-    )
-    made = {source: SOURCE, tests: TESTS, tmp_path / "toy/__init__.py": ""}
-    made[tmp_path / "pytest.ini"] = "[pytest]\nfilterwarnings = error\n"
-    for path, text in made.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-
-    def run(*words):
-        command = [sys.executable, TOOL, "toy", "--root", tmp_path, "--record", record, *words]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        return json.loads(record.read_text()), done
-
-    errors, done = run("-n", "99")
-    name = "tests/toy/test_a.py::test_"
-    assert done.stderr == f"left out, as it fails without any error: {name}broken\n"
-    assert {(line, new.strip(), fate) for _, line, _, new, fate in errors} == {
-        # Nothing observable changes: at the limit itself both ways give the limit.
-        (6, "if (value >= high):", "survived"),
-        (6, "if (not value > high):", f"{name}clip"),
-        (6, "pass", f"{name}clip"),
-        (7, "return None", f"{name}clip"),
-        (8, "return None", f"{name}clip"),
-        (12, "return None", "survived"),
-    }
-    assert done.stdout.endswith("caught 4 of 6\n")
-    assert source.read_text() == SOURCE
-    # The same errors once the file and its tests are others.
-    source.write_text("# A line more.\n" + SOURCE.replace("return value", "return  value"))
-    tests.write_text(TESTS.replace("2, 3, 4)", "2)").replace("2, 3, 3]", "2]"))
-    replayed, done = run("--replay", record)
-    assert [entry[:4] for entry in replayed] == [entry[:4] for entry in errors]
-    assert [fate for _, line, _, _, fate in replayed if line == 12] == ["source changed"]
-    assert done.stdout.endswith("caught 2 of 5\n")
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,6 @@ def script(name, folder="scripts"):
     return module
 
 
-headline = script("headline", "../benchmarks")
-
-
 @pytest.fixture(scope="module")
 def fill_pages():
     before = list(sys.path)
@@ -72,15 +69,6 @@ def test_a_line_is_filled_and_others_stay(fill_pages):
     assert all(f"`{name}`" in filled for name in ALGORITHMS)
 
 
-def test_definitions_are_cut_out_whole(fill_pages):
-    text = "A = 1\n\n\n@cached\ndef f():\n    return A\n\n\n"
-    text += "class B:\n    def g(self):\n        return 2\n"
-    definition = script("code_blocks").definition
-    assert definition(text, "A", "") == "A = 1"
-    assert definition(text, "f", "") == "@cached\ndef f():\n    return A"
-    assert definition(text, "B.g", "") == "def g(self):\n    return 2"
-
-
 @pytest.mark.parametrize("page", sorted((DOCS / "algorithms").glob("*.md")), ids=lambda p: p.stem)
 def test_pages_of_algorithms_have_one_form(page):
     text = page.read_text()
@@ -94,38 +82,3 @@ def test_pages_of_algorithms_have_one_form(page):
 def test_every_page_of_an_environment_says_who_finds_it_hard():
     for page in (DOCS / "environments").glob("*-*.md"):
         assert "\n## Who finds it hard\n" in page.read_text(), page.name
-
-
-def test_links_that_lead_nowhere_are_found(tmp_path):
-    check_links = script("check_links")
-    (tmp_path / "b.html").write_text('<p id="here"></p>')
-    links = ["b.html", "b.html#here", "#top", "https://example.org/x", "data:,x"]
-    bad = ["b.html#there", "c.html", "#nowhere"]
-    anchors = "".join(f'<a href="{url}"></a>' for url in links + bad)
-    (tmp_path / "a.html").write_text(
-        f'<h1 id="top"></h1>{anchors}<link rel="search" href="b.html">'
-        '<script src="https://cdn.example.org/x.js"></script><img src="data:,x">'
-    )
-    assert check_links.faults(tmp_path) == [
-        "a.html loads https://cdn.example.org/x.js",
-        "a.html links to b.html#there, where there is no place there",
-        "a.html links to c.html, which is not there",
-        "a.html links to #nowhere, where there is no place nowhere",
-    ]
-
-
-def test_blocks_of_the_headline_study_are_replaced_and_the_others_stay():
-    page = (
-        "a\n<!-- headline: tuned -->\nold\n<!-- end -->\nb\n"
-        "<!-- headline: what-fell -->\nkept\n<!-- end -->\n"
-    )
-    once = headline.filled(page, {"tuned": "| new \\1 |\n\nlegend\n"})
-    assert once == page.replace("old", "| new \\1 |\n\nlegend")
-    assert headline.filled(once, {"tuned": "old"}) == page
-    assert {
-        path.name: {block[2] for block in headline.BLOCK.finditer(path.read_text(encoding="utf-8"))}
-        for path in headline.PAGES
-    } == {
-        "README.md": {"held-out"},
-        "library-vs-hand-rolled.md": {"held-out"},
-    }

@@ -115,9 +115,7 @@ def test_kl_ucb_index_solves_its_equation(mean, count, pulls):
 
 def test_kl_ucb_where_it_has_a_closed_form():
     for budget in (1e-6, 0.1, 1.0, 5.0):
-        assert rules.kl_upper_bound(0.0, budget) == pytest.approx(
-            1 - math.exp(-budget), rel=1e-12
-        )
+        assert rules.kl_upper_bound(0.0, budget) == pytest.approx(1 - math.exp(-budget), rel=1e-12)
         assert rules.kl_upper_bound(1.0, budget) == 1.0
     assert rules.kl_upper_bound(0.3, 0.0) == 0.3
     with_c = rules.kl_ucb_index(0.3, 10, 100, 3.0)

@@ -1,4 +1,4 @@
-"""What commands answer: by which name, to mistakes, and what they say before they load much."""
+"""What commands answer: by which name, before they load much, and to mistakes, in a line."""
 
 import os
 import shlex
@@ -7,11 +7,13 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import pytest
+import yaml
+
+from tests.pipeline.short_runs import trained
+
 ROOT = Path(__file__).parents[2]
 LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
-
-
-# --- by which name the commands are called, and call each other ---------------------------------
 
 
 def test_training_by_the_installed_name(type_command, tmp_path):
@@ -40,9 +42,8 @@ def test_mistakes_name_the_installed_command(type_command):
     assert type_command("yardstick", "--version") == (0, f"{version('rl-yardstick')}\n", "")
 
 
-# --- what is said before anything heavy is loaded -----------------------------------------------
-
 QUICKLY = ("train --help", "train --list", "compare --help", "enjoy --algo ppo --env CartPole-v1")
+QUICKLY += ("train --env CartPole-v1 --algo ppo -params gama:1",)
 PROGRAM = """
 import sys
 from rl_yardstick import commands
@@ -64,4 +65,31 @@ def test_answers_before_anything_heavy_is_loaded(tmp_path):
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, check=True)
     codes = [line for line in done.stdout.splitlines() if line.startswith("ANSWER ")]
-    assert codes == ["ANSWER 0"] * 3 + ["ANSWER 2"]
+    assert codes == ["ANSWER 0"] * 3 + ["ANSWER 2"] * 2
+
+
+TABLE = yaml.safe_load(Path(__file__).with_name("wrong_commands.yml").read_text(encoding="utf-8"))
+NEEDS_RUNS = ("logs/qlearning", "logs/linucb", "enjoy.py --algo qlearning")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    trained("qlearning", folder=folder / "logs", n_timesteps=300)
+    trained("linucb", "SegmentBandit-v0", folder=folder / "logs", n_timesteps=300)
+    return folder
+
+
+@pytest.mark.parametrize("line", TABLE["commands"])
+def test_mistakes_are_one_line(line, type_command, tmp_path, request):
+    for name, text in TABLE["files"].items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    if any(word in line for word in NEEDS_RUNS):
+        (tmp_path / "logs").symlink_to(request.getfixturevalue("runs") / "logs")
+    before = set(tmp_path.rglob("*"))
+    code, out, err = type_command(*shlex.split(line))
+    assert code == 2, out + err
+    assert err.count("\n") == 1, err
+    assert "Traceback" not in out + err
+    assert set(tmp_path.rglob("*")) == before
+    assert len(err) < 1200

@@ -1,61 +1,30 @@
-"""compare.py as a user types it: what is run, what is skipped, and what survives."""
+"""compare.py and tune.py as a user types them: what is run, what is skipped, and what survives."""
 
 import contextlib
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import gymnasium as gym
 import pandas as pd
 import pytest
+from filelock import FileLock
 from PIL import Image
+
+import rl_yardstick.envs  # noqa: F401
+from rl_yardstick.envs.bandits import log_uniformly
+from rl_yardstick.experiments.off_policy import difference_in_value
+from tests.pipeline.short_runs import trained
 
 COMPARE = Path(__file__).parents[2] / "compare.py"
 LAKE = ["--env", "FrozenLake-v1", "--no-report", "-f", "studies"]
 PAIR = [*LAKE, "--algos", "qlearning", "sarsa", "--n-episodes", "60"]
-
-# An environment of a user's own, slow while there is no file that says it may hurry.
-WALKS = """
-import time
-from pathlib import Path
-
-import gymnasium as gym
-
-MARK = Path(__file__).with_name("mark")
-
-
-class Slow(gym.Env):
-    observation_space = gym.spaces.Discrete(5)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place = 0
-        return 0, {}
-
-    def step(self, action):
-        if not MARK.exists():
-            time.sleep(0.02)
-        self.place = min(max(self.place + 2 * int(action) - 1, 0), 4)
-        return self.place, float(self.place == 4), self.place == 4, False, {}
-
-
-gym.register("Slow-v0", entry_point=Slow, max_episode_steps=20)
-"""
-
-
-@pytest.fixture
-def folder(own_folder):
-    (own_folder / "walks.py").write_text(WALKS)
-    return own_folder
-
-
-@pytest.fixture
-def type_command(folder, type_study):
-    return type_study
 
 
 def wait_for(condition, seconds=60):
@@ -85,49 +54,50 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir() if path.name != ".lock")
 
 
-def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(type_command, folder):
-    study = folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
-    code, out, err = type_command(*PAIR, "--seeds", 1)
+@pytest.mark.usefixtures("in_this_process")
+def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(typed, own_folder):
+    study = own_folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
+    code, out, err = typed("compare.py", *PAIR, "--seeds", 1)
     assert (code, err) == (0, "")
     assert "2 runs, 0 of them there already" in out
     first = records(study)
     assert sorted(first) == [("qlearning", "FrozenLake-v1_1"), ("sarsa", "FrozenLake-v1_1")]
     assert names(study) == FILES
-    assert "4 runs, 2 of them there already" in type_command(*PAIR, "--seeds", 2)[1]
+    assert "4 runs, 2 of them there already" in typed("compare.py", *PAIR, "--seeds", 2)[1]
     assert first.items() <= records(study).items()
     assert sorted(rows(study)["seed"]) == [0, 0, 1, 1]
     words = ["--algo", "sarsa", "--env", "FrozenLake-v1", "--seed", 0, "--n-episodes", 60]
-    assert type_command(*words, program="train.py")[0] == 0
-    places = (folder / "logs", study / "runs")
+    assert typed("train.py", *words)[0] == 0
+    places = (own_folder / "logs", study / "runs")
     paths = (place / "sarsa" / "FrozenLake-v1_1" / "0.monitor.csv" for place in places)
     theirs, ours = (pd.read_csv(path, skiprows=1)[["r", "l"]] for path in paths)
     assert theirs.equals(ours)
     # Finished runs of other settings stay as they are.
-    first, other = records(study), [*PAIR, "--seeds", 2, "-params", "gamma:0.9"]
-    code, out, err = type_command(*other)
+    first = records(study)
+    code, out, err = typed("compare.py", *PAIR, "--seeds", 2, "-params", "gamma:0.9")
     assert (code, err.count("\n")) == (2, 1)
     assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now): give" in err
     assert records(study) == first
     # What a study's record says is enough to do it elsewhere.
-    (folder / "copy").mkdir()
-    (folder / "copy" / "study.json").write_bytes((study / "study.json").read_bytes())
-    assert type_command("--resume", "copy", "--no-report")[0] == 0
+    (own_folder / "copy").mkdir()
+    (own_folder / "copy" / "study.json").write_bytes((study / "study.json").read_bytes())
+    assert typed("compare.py", "--resume", "copy", "--no-report")[0] == 0
     columns = ["agent", "seed", "final", "training", "n_timesteps"]
-    assert rows(folder / "copy")[columns].equals(rows(study)[columns])
-    code, _, err = type_command("--resume", "copy", "--seeds", 3)
+    assert rows(own_folder / "copy")[columns].equals(rows(study)[columns])
+    code, _, err = typed("compare.py", "--resume", "copy", "--seeds", 3)
     assert (code, "--seeds cannot be given with --resume" in err) == (2, True)
 
 
-def test_films_and_pages_of_training(type_command, folder, monkeypatch):
-    monkeypatch.setattr(
-        "rl_yardstick.report.figures.write_figures", lambda *_: []
-    )  # which take longest
+@pytest.mark.usefixtures("in_this_process")
+def test_films_and_pages_of_training(typed, own_folder, monkeypatch):
+    # What takes longest.
+    monkeypatch.setattr("rl_yardstick.report.figures.write_figures", lambda *_: [])
     monkeypatch.setattr("rl_yardstick.report.films.film_of", lambda _: None)
     words = ["--env", "FrozenLake-v1", "--algos", "qlearning", "--n-episodes", 40, "--seeds", 1]
     words += ["-j", 1, "-f", "studies", "--watch-learning", "--render-every", 20]
-    code, out, err = type_command(*words)
+    code, out, err = typed("compare.py", *words)
     assert (code, err) == (0, "")
-    study = folder / "studies" / "FrozenLake-v1_qlearning"
+    study = own_folder / "studies" / "FrozenLake-v1_qlearning"
     place = "learning/qlearning/FrozenLake-v1_1.html"
     assert place in out.split()
     assert "<h1>qlearning on FrozenLake-v1</h1>" in (study / place).read_text(encoding="utf-8")
@@ -137,12 +107,9 @@ def test_films_and_pages_of_training(type_command, folder, monkeypatch):
     for path in films:
         with Image.open(path) as film:
             assert film.n_frames > 1
-    code, out, err = type_command(*words, "--no-report")
+    code, out, err = typed("compare.py", *words, "--no-report")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "leave out --no-report" in err
-
-
-# --- a command that is stopped, and a second one beside it ----------------------------------------
 
 
 def is_alive(pid):
@@ -164,13 +131,16 @@ def session_of(leader):
     return found
 
 
-SLOW = ["--env", "Slow-v0", "--gym-packages", "walks", "--algos", "qlearning"]
+WALKS = Path(__file__).parents[1] / "experiments" / "walks.py"
+SLOW = ["--env", "Walk-v0", "--env-kwargs", "is_slow:True", "--gym-packages", "walks"]
+SLOW += ["--algos", "qlearning"]
 SLOW += ["--no-report", "-n", "2000", "--seeds", "2", "-j", "2", "-f", "studies"]
 
 
 @pytest.fixture
-def begun(folder, type_command):
+def begun(own_folder):
     """A study in the middle of its runs: the command, its folder, all of its processes."""
+    shutil.copy(WALKS, own_folder)
     process = subprocess.Popen(
         [sys.executable, str(COMPARE), *SLOW],
         stdout=subprocess.PIPE,
@@ -178,7 +148,7 @@ def begun(folder, type_command):
         text=True,
         start_new_session=True,
     )
-    study = folder / "studies" / "Slow-v0_qlearning"
+    study = own_folder / "studies" / "Walk-v0_qlearning"
     wait_for(lambda: len(list(study.glob("runs/*/*/state.bin"))) == 2)
     yield process, study, session_of(process.pid)
     if process.poll() is None:
@@ -189,34 +159,30 @@ def states(study):
     return [json.loads(path.read_text())["state"] for path in study.glob("runs/*/*/run.json")]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_the_same_command_does_what_is_left(number, type_command, folder, begun):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_the_same_command_does_what_is_left(number, typed, own_folder, begun):
     process, study, started = begun
     # A second command says that the folder is in use, and touches nothing.
-    code, _, err = type_command(*SLOW, "-params", "gamma:0.5")
+    code, _, err = typed("compare.py", *SLOW, "-params", "gamma:0.5")
     assert (code, err.count("\n"), "in use by another command" in err) == (2, 1, True)
-    if number == signal.SIGINT:
-        os.killpg(process.pid, number)  # as a terminal sends it
-    else:
-        process.send_signal(number)
+    # A terminal sends a signal to all processes.
+    (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
     out, err = process.communicate(timeout=120)
     wait_for(lambda: not any(map(is_alive, started)))
     if number == signal.SIGKILL:
         assert process.returncode == -number
     else:
         assert (process.returncode, err) == (128 + number, "")
-        assert f"stopped; continue with: python {COMPARE} --resume studies/Slow-v0_qlearning" in out
+        assert f"stopped; continue with: python {COMPARE} --resume studies/Walk-v0_qlearning" in out
         assert states(study) == ["interrupted"] * 2
-    (folder / "mark").touch()
+    (own_folder / "mark").touch()
     begun_at = {path: path.stat().st_mtime_ns for path in study.glob("runs/*/*/0.monitor.csv")}
-    code, out, _ = type_command("--resume", study, "--gym-packages", "walks", "--no-report")
+    code, out, _ = typed("compare.py", "--resume", study, "--gym-packages", "walks", "--no-report")
     assert (code, "2 runs, 0 of them there already" in out) == (0, True)
     assert len(begun_at) == 2
     assert states(study) == ["finished"] * 2
     assert names(study) == FILES
 
-
-# --- --until-decided -----------------------------------------------------------------------------
 
 BANDITS = """
 title: Two bandits
@@ -233,16 +199,104 @@ def last_line(out):
     return [line for line in out.splitlines() if line][-1]
 
 
-def test_it_grows_until_decided_and_remembers_its_looks(type_command, folder):
-    (folder / "bandits.yml").write_text(BANDITS)
+@pytest.mark.usefixtures("in_this_process")
+def test_it_grows_until_decided_and_remembers_its_looks(typed, own_folder):
+    (own_folder / "bandits.yml").write_text(BANDITS)
     words = ["bandits.yml", "--until-decided", "--no-report", "--max-seeds", 14, "-j", 2, "-f", "s"]
-    code, whole, err = type_command(*words)
+    code, whole, err = typed("compare.py", *words)
     assert (code, err) == (0, "")
     assert "look 1 of 3, at 6 seeds: " in whole
-    study = folder / "s" / "bandits"
+    study = own_folder / "s" / "bandits"
     n_runs, record = len(rows(study)), (study / "study.json").read_bytes()
     last = f"{n_runs} runs, where 14 seeds of each agent would be 42; "
     assert last_line(whole).startswith(last)
-    code, out, _ = type_command(*words)
+    code, out, _ = typed("compare.py", *words)
     assert (code, last_line(out)) == (0, last_line(whole))
     assert (study / "study.json").read_bytes() == record
+
+
+def test_agents_of_the_library_and_blind_ones_are_judged(type_command, tmp_path, monkeypatch):
+    """The table and the verdicts of another agent are recorded in ``tests/golden``."""
+    monkeypatch.setenv("COLUMNS", "120")  # room for the paths of runs
+    log = {"env_kwargs": {"log": "log.csv"}}
+    small = {"n_steps": 64, "batch_size": 64}
+    with gym.make("SegmentBandit-v0") as env:
+        log_uniformly(env, 1500, 0, tmp_path / "log.csv")
+    blind, ppo = "logs/thompson/ReplayBandit-v0_1", "logs/ppo/ReplayBandit-v0_1"
+    trained("thompson", "ReplayBandit-v0", {"ignore_context": True, **log}, n_timesteps=1500)
+    trained("ppo", "ReplayBandit-v0", {**small, **log}, n_timesteps=200)
+    code, out, err = type_command("compare.py", "--logged", "log.csv", "--policy", blind, ppo)
+    assert (code, err) == (0, "")
+    for run in (blind, ppo):
+        assert f"{run} was trained on this log: its figures flatter it" in out
+    shutil.copy(tmp_path / ppo / "ReplayBandit-v0.zip", "alone.zip")
+    code, _, err = type_command("compare.py", "--logged", "log.csv", "--policy", "alone.zip")
+    assert code == 2
+    assert "is in no run folder" in err
+
+
+def test_the_python_of_the_page_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = Path(__file__).parents[2] / "docs" / "bandits.md"
+    draw, decide = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    names = {}
+    exec(draw, names)  # noqa: S102
+    exec(decide, names)  # noqa: S102
+    names["env"].close()
+    printed = capsys.readouterr().out
+    # What the page quotes: +0.036 [+0.016, +0.056] against arm 1.
+    assert printed.startswith("always arm 1 Estimate(point=0.036")
+    estimate = difference_in_value(names["linucb"].terms, names["best"].terms, n_comparisons=4)
+    assert (estimate.low, estimate.high) == pytest.approx((0.016, 0.056), abs=6e-4)
+
+
+SPACE = """\
+default:
+  learning_rate: {low: 0.01, high: 1.0, scale: log}
+  gamma: {low: 0.5, high: 1.0}
+"""
+# Without a look ahead nothing is learnt but the last step.
+BLIND = "FrozenLake-v1: {n_episodes: 600, learning_rate: 0.1, gamma: 0.0}"
+SEARCH = """
+--env FrozenLake-v1 --env-kwargs is_slippery:False --algo qlearning --n-episodes 600
+--search-space space.yml --conf-file blind.yml --storage sqlite:///trials.db -j 1 --no-report
+--trials 4 --seeds-per-trial 1 --n-startup-trials 3 --retest 1 --retest-seeds 8
+--until-decided --max-retest-seeds 12
+"""
+PLACE = Path("logs/tuning/FrozenLake-v1_qlearning")
+
+
+@pytest.fixture
+def files(own_folder):
+    (own_folder / "space.yml").write_text(SPACE)
+    (own_folder / "blind.yml").write_text(BLIND)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_search_finds_better_settings_and_its_re_test_grows_until_decided(typed, files):
+    code, out, err = typed("tune.py", *SEARCH.split())
+    assert (code, err) == (0, "")
+    assert "look 1 of 2, at 8 seeds: all pairs are decided" in out
+    record = json.loads((PLACE / "tuning.json").read_text())
+    assert len(record["trials"]) == 4
+    for trial in record["trials"]:
+        assert sorted(trial["figures"]) == [str(seed) for seed in record["seeds"]]
+        assert [trial["value"]] == [*trial["figures"].values()]  # one seed
+    _, best = record["retest"]["settings"]
+    winner = best["label"]
+    assert winner != "trial 0"
+    assert f"winner: {winner}, in {PLACE / 'winner.yml'}" in out
+    assert f"{winner}: 1 (95 % interval of the mean: 1 to 1), 8 runs" in out
+    assert record["retest"]["winner"] == winner
+    assert record["retest"]["optimism"] == best["in_search"] - best["held_out"]
+    assert record["held_out_seeds"] == [*range(1000, 1008)]
+    code, again, _ = typed("tune.py", *SEARCH.split())
+    assert code == 0
+    assert "16 runs, 16 of them there already" in again
+    code, _, err = typed("tune.py", *SEARCH.split(), "--max-retest-seeds", "20")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "the looks were planned before the first of them and cannot change" in err
+    with FileLock(PLACE / ".lock"):
+        code, _, err = typed("tune.py", *SEARCH.split())
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"{PLACE} is in use by another command" in err

@@ -1,4 +1,4 @@
-"""``explain`` as a user types it: runs, zips, changes that are tried, files, refusals."""
+"""`explain`, `audit` and `shaping` as a user types them: answers, files, refusals."""
 
 import json
 import shutil
@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from rl_yardstick.diagnosis import target_probes
+from rl_yardstick.diagnosis.audit import audit
 from rl_yardstick.pipeline.settings import read_entry
 from rl_yardstick.report.documents import write_tables
-from tests.pipeline.short_runs import CART, LAKE, trained
+from tests.pipeline.short_runs import LAKE, trained
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +41,7 @@ def test_a_run_is_explained_in_twelve_lines_and_as_json(type_command, run):
     assert zipped.splitlines()[1:] == out.splitlines()[1:]
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, run):
     words = ("--test", "n_timesteps:60000", "--test", "gamma:0.5", "--json", "why.json")
     code, out, _ = type_command("explain", run, *words, "-j", 1)
@@ -48,7 +51,6 @@ def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, r
     assert code == 0
     assert [*tried] == ["as shipped", "as it is", "n_timesteps:60000", "gamma:0.5"]
     assert {len(returns) for returns in tried.values()} == {4}
-    assert "16 runs, 0 of them there already" in out
     assert "n_timesteps:60000 helps most" in out
     assert "16 runs, 16 of them there already" in type_command("explain", run, *words)[1]
 
@@ -62,11 +64,9 @@ def test_what_each_cell_costs_is_drawn_and_written_down(type_command, run, tmp_p
 
 
 def test_what_cannot_be_explained_is_refused_in_one_line(type_command, run):
-    cart = trained("random", CART, n_timesteps=100)[0].path
     for words, line in (
         ([run, "--test", "gama:0.9"], "gama"),
         ([run, "--map", "costs.svg"], "--map writes a .png"),
-        ([cart], "the model of CartPole-v1 is not known"),
     ):
         code, _, err = type_command("explain", *words)
         assert (code, err.count("\n")) == (2, 1)
@@ -87,3 +87,137 @@ def test_of_a_study_the_median_run_of_a_pair_is_explained(type_command, report_s
     code, _, err = type_command("explain", folder, *pair[:2])
     assert (code, err.count("\n")) == (2, 1)
     assert "choose one by --env: FrozenLake-v1, Warehouse-v0" in err
+
+
+# Q-learning in which an episode that is cut off counts as ended.
+SCRIPT = """
+import numpy as np
+
+def train(make_env, seed, gamma, steps):
+    rng, env = np.random.default_rng(seed), make_env()
+    q, obs = np.zeros((env.observation_space.n, 2)), env.reset(seed=seed)[0]
+    for _ in range(steps):
+        action = int(rng.integers(2)) if rng.random() < 0.5 else int(q[obs].argmax())
+        following, reward, terminated, truncated, _ = env.step(action)
+        done = terminated or truncated
+        q[obs, action] += 0.1 * (reward + gamma * q[following].max() * (not done) - q[obs, action])
+        obs = env.reset()[0] if done else following
+    class Agent:
+        act = staticmethod(lambda obs: int(q[obs].argmax()))
+        values = staticmethod(lambda obs: q[obs])
+    return Agent()
+
+number, bare = 3, lambda: None
+
+def broken(make_env, seed, gamma, steps):
+    1 / 0
+"""
+
+
+def test_a_script_of_ones_own(type_command, tmp_path):
+    (tmp_path / "my_audited_script.py").write_text(SCRIPT)
+    words = ("--script", "my_audited_script:train", "--kind", "q_learning", "--json", "out.json")
+    code, out, err = type_command("audit", *words)
+    assert (code, err) == (1, "")
+    assert "an episode that is cut off          FAULT\n" in out
+    assert "\nfault: no-bootstrap-at-truncation. A truncated episode is treated as " in out
+    assert "right would be: 5 in both" in " ".join(out.split())
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert (found["verdict"], found["fault"]) == ("fault", "no-bootstrap-at-truncation")
+    assert found["faults"][0]["source"].startswith("Pardo et al. (2018)")
+
+
+def test_a_class_of_ones_own(type_command, tmp_path, monkeypatch):
+    text = "from rl_yardstick.agents.tabular.one_step import QLearning\n\nMine = QLearning\n"
+    (tmp_path / "my_audited_agents.py").write_text(text)
+    few = (target_probes.probe_ends, target_probes.probe_discount)
+    monkeypatch.setattr(audit, "__defaults__", (few,))
+    code, out, err = type_command("audit", "--algo", "my_audited_agents:Mine")
+    assert (code, err) == (0, "")
+    assert out.endswith("right, as far as these probes see\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--algo qlerning", "did you mean 'qlearning'?"),
+        ("--algo ucb", "--algo ucb: it is for bandits"),
+        ("--algo qlearning -params gama:0.5", "has no hyperparameter 'gama'"),
+        ("--algo my_refused:number", "number is no subclass of Stable-Baselines3's BaseAlgorithm"),
+        ("--script my_refused:bare", "must take make_env, seed, gamma, steps"),
+        ("--script my_refused:broken", "cannot train on a tiny world: ZeroDivisionError"),
+    ],
+)
+def test_mistakes_end_in_one_line(type_command, tmp_path, words, told):
+    name = tmp_path.name  # another one each time: modules stay imported
+    (tmp_path / f"{name}.py").write_text(SCRIPT)
+    code, out, err = type_command("audit", *words.replace("my_refused", name).split())
+    assert (code, out) == (2, "")
+    assert told in err
+    assert len(err.splitlines()) == 1
+
+
+RETURN = "optimal policies return"
+
+
+@pytest.fixture
+def shape(type_command):
+    """Type the command: its lines, and what it writes."""
+
+    def run(*words):
+        code, out, err = type_command("shaping", *words, "--json", "s.json")
+        assert (code, err) == (0, "")
+        return out.splitlines(), json.loads(Path("s.json").read_text())
+
+    return run
+
+
+def test_the_shipped_changes_of_warehouses_cost_nothing(shape):
+    lines, data = shape("--env", "Warehouse-v0", "--algo", "ppo")
+    told = "random starts, episodes of 100 steps, rewards clipped at -10, rewards x 0.01"
+    assert lines[0].endswith(told)
+    assert lines[1:3] == [
+        "discount 0.9995: the same policies are optimal",
+        f"  with the changes {RETURN} 79; the optimum is 79: the changes cost nothing",
+    ]
+    assert [one["same"] for one in data["objectives"]] == [True, True]
+    assert [one["discount"] for one in data["objectives"]] == [0.9995, 1.0]
+    assert data["objectives"][0]["factor"] is None  # clipping is no potential
+
+
+def test_rewards_that_make_another_policy_optimal(shape):
+    words = ("--gamma", 0.9, "--train-env-kwargs", "reward_schedule:[1,-1,-0.5]")
+    lines, data = shape("--env", "FrozenLake-v1", *words)
+    assert lines[1].startswith("discount 0.9: NOT the same policies are optimal: the best actions")
+    assert sum(place["gain"] for place in data["objectives"][0]["states"]) == pytest.approx(
+        0.6971, abs=5e-5
+    )
+    assert lines[2].startswith("  row 1, column 1: best is left, with the changes down or right; ")
+    assert lines[3].endswith("; the optimum is 0.74419: the changes cost 0.6971")
+
+
+def test_wrappers_in_order_and_the_agents_own_discount(shape):
+    wrappers = ("--wrapper", "gymnasium.wrappers.ClipReward", "min_reward:-1")
+    wrappers += ("--wrapper", "rl_yardstick.envs.wrappers.ScaleReward", "scale:3")
+    lines, data = shape("--env", "CliffWalking-v1", "--algo", "qlearning", *wrappers)
+    assert lines[0] == "CliffWalking-v1; changed in training: rewards clipped at -1, rewards x 3"
+    # It does not discount. The cliff is as cheap as any step then, but leads back to the start.
+    assert [(one["discount"], one["same"]) for one in data["objectives"]] == [(1, True)]
+    assert data["optimum"] == -13
+
+
+WITHOUT_A_MODEL = {
+    "--env CartPole-v1": "the model of CartPole-v1 is not known",
+    "--env Warehouse-v0 --wrapper rl_yardstick.envs.wrappers.ScaleReward scal:2": "scal",
+    "--env FrozenLake-v1 -params normalize:true": "normalize: the rewards that it makes",
+    "--env FrozenLake-v1 --train-env-kwargs map_name:8x8": (
+        "64 states and 4 actions cannot be compared with 16 states and 4 actions"
+    ),
+}
+
+
+def test_what_has_no_model_is_refused_in_one_line(type_command):
+    for words, said in WITHOUT_A_MODEL.items():
+        code, _, err = type_command("shaping", *words.split())
+        assert (code, err.count("\n")) == (2, 1)
+        assert said in err

@@ -3,7 +3,6 @@
 import re
 
 import pytest
-from optuna.trial import create_trial
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.commands import compare, enjoy, train, tune
@@ -16,8 +15,6 @@ from rl_yardstick.experiments.study import StudySpec
 from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.spec import TrainSpec
-from rl_yardstick.tuning.retesting import retest_study
-from rl_yardstick.tuning.suggesting import planned_runs
 
 TRAIN, ENJOY, COMPARE = train, enjoy, compare
 LAKE = ["--env", "FrozenLake-v1"]
@@ -37,9 +34,6 @@ def tuned(*words):
 
 SHORT = ["--algo", "qlearning", "-n", "60"]
 PAIR = [*LAKE, "--algos", "qlearning", "-n", "60"]
-
-
-# --- a flag reaches the field that has its name -----------------------------------------------
 
 
 def test_flags_of_train_reach_the_specification():
@@ -96,17 +90,6 @@ def test_the_file_of_a_map_is_in_the_titles_and_not_in_the_folders(tmp_path):
     assert first.environment == "Warehouse-v0 (depot.txt)"
     assert (first.path.name, first.spec.map_name) == ("Warehouse-v0_1", "depot.txt")
     assert trained(*SHORT, *place).map_name == "depot.txt"
-    label = tuned("--algo", "qlearning", "-n", "60", *place).study.environments[0].label
-    assert label == "Warehouse-v0 (depot.txt)"
-    file = tmp_path / "mine.yml"
-    entry = f"{{env_kwargs: {{desc: '{path}'}}}}"
-    file.write_text(f"agents: [qlearning]\nenvironments:\n  Warehouse-v0: {entry}\n")
-    assert plan(compared(str(file)), tmp_path)[0].environment == "Warehouse-v0 (depot.txt)"
-    file.write_text(f"agents: [qlearning]\nenvironments:\n  own: {{id: Warehouse-v0, {entry[1:]}\n")
-    assert plan(compared(str(file)), tmp_path)[0].environment == "own"
-
-
-# --- what values mean, and what is refused in one line -----------------------------------------
 
 
 MEANINGS = [
@@ -130,9 +113,6 @@ def test_what_a_value_means(module, flag, taken, refused):
     for text in refused.split():
         with pytest.raises(UserError, match=re.escape(f"not {text!r}")):
             parser.parse_args([f"{flag}={text}"])
-
-
-# --- which engine: what --engine makes of trainings, studies and searches ------------------------
 
 
 ENGINES = [
@@ -171,26 +151,6 @@ def test_what_is_refused_by_every_command():
             ask()
 
 
-def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(tmp_path):
-    for words, search, retest in (
-        ("ppo", "auto", None),
-        ("ppo -params engine:compiled", "compiled", "compiled"),
-        ("double_dqn", None, None),
-    ):
-        tuning = tuned("--algo", *words.split())
-        entry = {"n_timesteps": 10, **tuning.agent.settings}
-        run, *_ = planned_runs(tuning, tmp_path, entry)
-        assert run.spec.algorithm.get("engine") == search
-        trial = create_trial(value=0.5, user_attrs={"settings": entry})
-        study = retest_study(tuning, tmp_path, [trial])
-        engines = {r.spec.algorithm.get("engine") for r in plan(study, tmp_path)}
-        assert engines == {retest}
-        assert tuning.identity(entry, {})["search_engine"] == search  # another makes another search
-
-
-# --- a flag that there is not is answered with what was meant -----------------------------------
-
-
 def answer(module, words):
     with pytest.raises(UserError) as mistake:
         module.build_parser().parse_args(words.split(" "))
@@ -214,14 +174,9 @@ def test_what_was_meant():
         assert f"unknown argument {flag} 1: {said}" in answer(TRAIN, f"{flag} 1")
 
 
-# --- what may be typed beside --resume: nothing that the run has already, not even as it has it --
+# What may be typed beside --resume: nothing that the run has already, not even as it has it.
 
-ALLOWED = {
-    "--gym-packages": "math",
-    "--log-folder": "logs",
-    "--verbose": "0",
-    "--progress": None,
-}
+ALLOWED = {"--gym-packages": "math", "--log-folder": "logs", "--verbose": "0", "--progress": None}
 OTHERS = {"--engine": "auto", "--hyperparams": "gamma:0.9", "--eval-freq": "5"}
 OTHERS |= {"--eval-episodes": "5", "--env-kwargs": "a:1", "--eval-env-kwargs": "a:1"}
 

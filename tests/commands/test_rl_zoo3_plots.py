@@ -35,19 +35,10 @@ for command in json.loads(sys.argv[1]):
 
 def zoo(*commands, cwd):
     """What commands of rl_zoo3 print, in a process of the Python that has it."""
-    result = subprocess.run(
-        [peer_python(), "-c", RUN, json.dumps([list(map(str, words)) for words in commands])],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={
-            **os.environ,
-            "PYTHONPATH": str(ROOT),
-            "PYTHONWARNINGS": "ignore",
-            "MPLBACKEND": "Agg",
-        },
-    )
+    typed = json.dumps([list(map(str, words)) for words in commands])
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore", "MPLBACKEND": "Agg"}
+    program = [peer_python(), "-c", RUN, typed]
+    result = subprocess.run(program, cwd=cwd, env=env, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert "not found" not in result.stdout
     outputs = result.stdout.split("=====\n")[:-1]
@@ -55,10 +46,10 @@ def zoo(*commands, cwd):
     return outputs
 
 
-def test_plots_and_enjoy_of_rl_zoo3_take_our_runs(tmp_path, train_in):
+def test_plots_and_enjoy_of_rl_zoo3_take_our_runs(tmp_path, type_command):
     """All in one process, since it imports for seconds."""
     for algo, words in AGENTS.items():
-        train_in(tmp_path, "--algo", algo, "--env", ENV_ID, *SHORT, *words)
+        assert type_command("train.py", "--algo", algo, "--env", ENV_ID, *SHORT, *words)[0] == 0
     base = ["-f", "logs", "-e", ENV_ID]
     plot = [*base, "-a", *AGENTS, "-l", "ours", "-o", "data", "--no-display", "-print"]
     play = ["--algo", "ppo", "--env", ENV_ID, "-f", "logs", "--no-render", "-n", 150]

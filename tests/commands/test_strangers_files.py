@@ -84,9 +84,6 @@ def check_refused(answer, mark, *words):
         assert word in err
 
 
-# --- zips ----------------------------------------------------------------------------------------
-
-
 def test_a_zip_is_played_trained_further_or_judged(type_in_own_folder, evil_zip, mark, own_folder):
     with gym.make(ENV) as env:
         log_uniformly(env, 100, 0, own_folder / "log.csv")
@@ -112,9 +109,6 @@ def test_what_a_zip_holds_is_told(type_command, evil_zip, mark, own_folder):
     assert not mark.exists()
 
 
-# --- statistics and replay buffers ---------------------------------------------------------------
-
-
 def test_statistics_in_a_hand_written_agents_folder(type_in_own_folder, own_folder, payload, mark):
     run = hand_written_run(own_folder / "gift")
     (run / ENV).mkdir()
@@ -135,9 +129,6 @@ def test_a_replay_buffer_beside_the_agent(type_in_own_folder, own_folder, payloa
     (own_folder / "replay_buffer.pkl").write_bytes(payload)
     words = ["--algo", "dqn", "--env", ENV, "-n", "8", "-i", "dqn.zip"]
     check_refused(type_in_own_folder("train.py", *words), mark, "replay_buffer.pkl")
-
-
-# --- modules that a file asks for ----------------------------------------------------------------
 
 
 ASKING = {

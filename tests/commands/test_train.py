@@ -14,18 +14,14 @@ import pytest
 import yaml
 
 from rl_yardstick.commands.terminal import result_lines
-from rl_yardstick.commands.train import describe_pulls, next_commands, rows_of
-from rl_yardstick.machine_code import WorkTime
+from rl_yardstick.commands.train import describe_pulls, next_commands
 from rl_yardstick.pipeline.callbacks import PullSummary
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
+from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
 from rl_yardstick.pipeline.run import Run
 
 LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 TRAIN = str(Path(__file__).parents[2] / "train.py")
-
-
-# --- the end of a run in words --------------------------------------------------------------------
 
 
 def sampled(*returns, **fields):
@@ -39,113 +35,72 @@ def exact(value, success, *yardstick, **more):
 
 
 POLE = Yardstick(optimum=500.0, baseline=20.0, at_least=480.0)
-OF_POLE = ["score 0   return 20   best random or constant policy", "optimum   480 to 500"]
-WAREHOUSE = "score 0   return -1000   best random or constant policy"
+NOTHING = "score 0   return 0   best random or constant policy"
 HIDES = HiddenState(95.8, (93.8, 93.8), with_memory=False)
 PULLS = {"n_pulls": 1000, "n_matched": 1000, "reward": 0.5, "optimal": 0.85}
 # The final evaluation, the pulls, and how the output ends.
-ENDS = {
-    "exact": (
-        exact(0.740206, 0.740206, 0.744190, 0.0495),
-        None,
+BEST = "best random or constant policy"
+ENDS = [
+    # Exact, optimal, nearly optimal.
+    (
+        *(exact(0.740206, 0.740206, 0.744190, 0.0495), None),
         "score 0.99   return 0.7402 of 0.7442 (gap 0.0040)   success 74 %",
-        "score 0   return 0.0495   best random or constant policy",
+        f"score 0   return 0.0495   {BEST}",
     ),
-    "optimal": (
-        exact(79 - 1e-14, 1.0, 79.0, -1000.0),
-        None,
-        "score 1   return 79 of 79   success 100 %",
-        WAREHOUSE,
+    (exact(79 - 1e-14, 1.0, 79.0, 0.0), None, "score 1   return 79 of 79   success 100 %", NOTHING),
+    (
+        *(exact(79 - 1e-9, 1 - 1e-4, 79.0, 0.0), None),
+        *("score 0.99   return 79 of 79 (gap 1e-09)   success 99.9 %", NOTHING),
     ),
-    "nearly optimal": (
-        exact(79 - 1e-9, 1 - 1e-4, 79.0, -1000.0),
-        None,
-        "score 0.99   return 79 of 79 (gap 1e-09)   success 99.9 %",
-        WAREHOUSE,
+    # Sampled, also between brackets, with a proof or not.
+    (
+        *(sampled(78.5, 79.0, yardstick=Yardstick(79.0, 0.0)), None),
+        *("score 0.99   return 78.75 of 79 (gap 0.25; sampled, 2 episodes)", NOTHING),
     ),
-    "episodes do not end": (
-        exact(-1000.0, 0.0, 79.0, -1000.0),
-        None,
-        "score 0.00   return -1000 of 79 (gap 1079)   success 0 %",
-        WAREHOUSE,
-    ),
-    "sampled": (
-        sampled(78.5, 79.0, yardstick=Yardstick(79.0, -1000.0)),
-        None,
-        "score 0.99   return 78.75 of 79 (gap 0.25; sampled, 2 episodes)",
-        WAREHOUSE,
-    ),
-    "far": (
-        exact(-1000.0, None, -11.66, -12.0),
-        None,
-        "score -2905.89   return -1000 of -11.66 (gap 988.34)",
-        "score 0   return -12   best random or constant policy",
-    ),
-    "bracketed": (
-        sampled(260.0, yardstick=POLE),
-        None,
+    (
+        *(sampled(260.0, yardstick=POLE), None),
         "score 0.50 to 0.52   return 260 of 500 at most (sampled, 1 episode)",
-        *OF_POLE,
+        *(f"score 0   return 20   {BEST}", "optimum   480 to 500"),
     ),
-    "bracketed without a proof": (
-        sampled(500.0, yardstick=replace(POLE, at_least=500.0, is_proven=False)),
-        None,
+    (
+        *(sampled(500.0, yardstick=replace(POLE, at_least=500.0, is_proven=False)), None),
         "score 1   return 500 of 500 at most (not proven; sampled, 1 episode)",
-        OF_POLE[0],
-        "optimum   500 (the upper end is not proven)",
+        *(f"score 0   return 20   {BEST}", "optimum   500 (the upper end is not proven)"),
     ),
-    "no optimum": (sampled(*[487.25] * 100), None, "return 487.2 (sampled, 100 episodes)"),
-    "no scale": (
-        exact(749.5, None, 750.0, 750.0),
-        None,
-        "return 749.5 of 750 (gap 0.5)",
-        "no score   return 750   best random or constant policy",
+    # Far below the scale, without an optimum, without a scale.
+    (
+        *(exact(-1000.0, None, -11.66, -12.0), None),
+        "score -2905.89   return -1000 of -11.66 (gap 988.34)",
+        f"score 0   return -12   {BEST}",
     ),
-    "hidden state": (
-        exact(-80.0, 1 / 15, 93.8, -40.0, 35.0, hidden=HIDES),
-        None,
+    (sampled(*[487.25] * 100), None, "return 487.2 (sampled, 100 episodes)"),
+    (
+        *(exact(749.5, None, 750.0, 750.0), None),
+        *("return 749.5 of 750 (gap 0.5)", f"no score   return 750   {BEST}"),
+    ),
+    (
+        *(exact(-80.0, 1 / 15, 93.8, -40.0, 35.0, hidden=HIDES), None),
         "score -0.54 to -0.30   return -80 of 93.80 at most   success 6.7 %",
-        "score 0   return -40   best random or constant policy",
+        f"score 0   return -40   {BEST}",
         "optimum   35 to 93.80 without memory, 93.80 with memory, 95.80 by the state",
     ),
-    "bandit": (
-        exact(159.0, None, 159.0, 117.0),
-        PullSummary(regret=127.984, **PULLS),
+    # Bandits.
+    (
+        *(exact(159.0, None, 159.0, 117.0), PullSummary(regret=127.984, **PULLS)),
         "regret 127.98 over 1,000 pulls   best arm in 85 % of the last 100",
-        "score 1   return 159 of 159",
-        "score 0   return 117   best random or constant policy",
+        *("score 1   return 159 of 159", f"score 0   return 117   {BEST}"),
     ),
-    "bandit from a log": (
-        None,
-        PullSummary(regret=None, **PULLS),
+    (
+        *(None, PullSummary(regret=None, **PULLS)),
         "regret not known   reward 0.5000 a pull over the 1,000 of 1,000 that are in the log",
     ),
-}
+]
 
 
-@pytest.mark.parametrize("case", ENDS)
-def test_how_a_run_ends(case):
-    final, pulls, *lines = ENDS[case]
-    told = [] if pulls is None else [describe_pulls(pulls)]
-    assert told + ([] if final is None else result_lines(final)) == lines
-
-
-def test_what_was_done():
-    others = OtherReturns("epsilon 0.1", 2.5, 0.9, 1.5, 1.75)
-    final = replace(sampled(1.0, 3.0, yardstick=POLE), others=others)
-    best = {"best": 20.0, "best_timesteps": 9, "best_episodes": 1, "taken": WorkTime(3.0, 0.5)}
-    parts = {"agent": {"num_timesteps": 1000}, "progress": {"taken": WorkTime()}}
-    made = {name: SimpleNamespace(**part) for name, part in {**parts, "evaluation": best}.items()}
-    outcome = SimpleNamespace(**made, engine="compiled", final=final, evaluation_steps=700)
-    assert rows_of(Run(Path("logs/qlearning/Lake-v1_3")), outcome) == [
-        ("trained", "1,000 steps in 0.0 s of processor time (1,000,000,000,000 steps/s)"),
-        ("engine", "compiled"),
-        ("beside", "return 2.500 with epsilon 0.1, as in training"),
-        ("beside", "return 1.500 of 1.750 (gap 0.250), discounted by 0.9"),
-        ("best", "score 0.00   return 20 of 500 at most (sampled, 1 episode)   at step 9"),
-        ("tests", "700 steps beside training (70% of it); 0.5 s of processor time"),
-        ("files", "logs/qlearning/Lake-v1_3"),
-    ]
+def test_how_a_run_ends():
+    for final, pulls, *lines in ENDS:
+        told = [] if pulls is None else [describe_pulls(pulls)]
+        assert told + ([] if final is None else result_lines(final)) == lines
 
 
 def test_what_to_type_next(monkeypatch):
@@ -160,12 +115,9 @@ def test_what_to_type_next(monkeypatch):
     assert watched == f"watch    python enjoy.py '{run.path}' --gym-packages mine"
 
 
-# --- whole commands -------------------------------------------------------------------------------
-
-
 def test_the_head_tells_what_auto_stands_for(type_command, tmp_path):
     slipping = ["--algo", "qlearning", "--env", "Warehouse-v0", "--env-kwargs", "slip:0.2"]
-    code, out, _ = type_command("train.py", *slipping, "-n", "500", "--seed", "0")
+    code, out, _ = type_command("train.py", *slipping, "-n", "500")
     assert code == 0
     assert "gamma=0.9995 (auto: 1 - 1/(2 x time limit of 1,000))" in " ".join(out.split())
     run = tmp_path / "logs" / "qlearning" / "Warehouse-v0_1"
@@ -207,19 +159,16 @@ def test_scripts_that_a_queue_starts_again(type_command, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_command_and_tells_how_to_resume(tmp_path, number):
+def test_a_signal_ends_a_command_and_tells_how_to_resume(type_command, tmp_path, number):
     words = [sys.executable, TRAIN, "--env", "CartPole-v1", "--algo", "ppo", "-n", "10000000"]
     process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     state = tmp_path / "logs/ppo/CartPole-v1_1/state.bin"
     begun = time.monotonic()
     while not state.exists() and time.monotonic() - begun < 200:
         time.sleep(0.1)
-    second = subprocess.run(
-        [sys.executable, TRAIN, "--resume", str(state.parent)],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert (second.returncode, second.stderr.count("\n")) == (2, 1)
-    assert f"is in use by another command, process {process.pid}" in second.stderr
+    code, _, err = type_command("train.py", "--resume", state.parent)
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"is in use by another command, process {process.pid}" in err
     process.send_signal(number)
     out, _ = process.communicate(timeout=100)
     assert process.returncode == 128 + number

@@ -13,6 +13,7 @@ from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
 from rl_yardstick.envs import checking
 from rl_yardstick.envs import known_models as known
+from rl_yardstick.envs.checking import check_transition_model
 from rl_yardstick.envs.warehouse import WarehouseEnv
 from tests.envs.corridors import Backwards, Corridor, Deaf, altered, outcomes, with_p
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rl_yardstick.agents.bandits.runs import run_batch
+from rl_yardstick.experiments import study as studies
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.bandits import (
     MAX_POINTS,
@@ -19,13 +20,7 @@ from rl_yardstick.experiments.bandits import (
     stacked_statistics,
 )
 from rl_yardstick.experiments.plan import plan
-from rl_yardstick.experiments.study import (
-    AgentSpec,
-    EnvironmentSpec,
-    StudySpec,
-    find_study,
-    read_study,
-)
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline.run import PULLS_FILE, Run
 from rl_yardstick.pipeline.training import train
 from rl_yardstick.report.series import auer_bound
@@ -36,14 +31,6 @@ COINS = (0.2, 0.5, 0.75)
 def pulls_in(folder):
     with np.load(folder / PULLS_FILE) as file:
         return dict(file)
-
-
-# --- Figures by pull, worked on paper where something is missing, else the plain way.
-
-# Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
-ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
-REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
-REGRETS = np.where(ARMS == 0, 0.3, 0.0)
 
 
 def test_every_figure_at_every_point_the_plain_way():
@@ -79,23 +66,7 @@ def test_every_figure_at_every_point_the_plain_way():
         assert found.shares[context] == pytest.approx(counts / counts.sum())
 
 
-def test_statistics_are_read_as_they_were_written(tmp_path):
-    given = {"moments": (1, 3), "posteriors": np.arange(16.0).reshape(2, 2, 1, 2, 2)}
-    given["true_means"] = np.array([[0.1, 0.2]])
-    written = pull_statistics(ARMS, REWARDS, REGRETS, None, 2, **given)
-    written.save(tmp_path / "statistics.npz")
-    read = PullStatistics.load(tmp_path / "statistics.npz")
-    for name, value in vars(written).items():
-        np.testing.assert_array_equal(getattr(read, name), value, strict=True)
-    assert read.posteriors.tolist() == given["posteriors"][0].tolist()  # of the first run alone
-
-
-# --- Batches where they may be, equal to their runs to the last bit.
-
 SEGMENTS = EnvironmentSpec("segments", "SegmentBandit-v0", {"n_timesteps": 200})
-LONG = EnvironmentSpec(
-    "long", "BernoulliBandit-v0", {"n_timesteps": 3000, "env_kwargs": {"pulls": 3000}}
-)
 ONE_EPISODE = replace(SEGMENTS, settings={"n_episodes": 1})
 
 
@@ -108,7 +79,6 @@ def study_of(agents, environments=(SEGMENTS,), n_seeds=5):
     ("algo", "settings", "environment", "is_batch"),
     [
         ("ucb", {}, SEGMENTS, True),
-        ("ucb", {}, LONG, True),
         ("ucb", {"n_timesteps": 1001}, SEGMENTS, False),  # more than an episode
         ("ucb", {}, ONE_EPISODE, False),
         ("ucb", {"n_envs": 2}, SEGMENTS, False),
@@ -170,24 +140,12 @@ def test_runs_beside_batches(tmp_path, do_study):
         assert run_regret(run) == pytest.approx(regret) == pytest.approx(in_time.sum())
 
 
-# --- The studies as they are shipped, with fewer runs.
-
-
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
         ("bernoulli", {"Thompson": 14.8, "UCB1": 82.0, "epsilon 0.1": 275.5, "random": 2666.7}),
-        (
-            "segments",
-            # The mean of alpha=0.2 is worse than that of 1 with a spread of 228 over runs.
-            {
-                "Thompson by segment": 37,
-                "Thompson, blind": 443,
-                "random": 653,
-                "LinUCB alpha=1": 31.0,
-                "LinUCB alpha=0.2": 155.0,
-            },
-        ),
+        # The mean of LinUCB with alpha 0.2, 155, has a spread of 228 over runs.
+        ("segments", {"Thompson by segment": 37, "Thompson, blind": 443, "LinUCB alpha=1": 31.0}),
     ],
 )
 def test_regret_of_ten_thousand_pulls(do_study, tmp_path, name, expected):
@@ -195,15 +153,15 @@ def test_regret_of_ten_thousand_pulls(do_study, tmp_path, name, expected):
 
     How well agents do is tested with the agents; here that a label stands for its agent.
     """
-    study = read_study(find_study(f"bandit-{name}"))
+    study = studies.read_study(studies.find_study(f"bandit-{name}"))
     kept = tuple(spec for spec in study.agents if spec.label in expected)
     place = study.environments[0]
-    study = replace(study, agents=kept, environments=(place,), n_seeds=60)
+    study = replace(study, agents=kept, environments=(place,), n_seeds=30)
     results = do_study(study, tmp_path)
     found = {label: results.pulls[label, place.label] for label in expected}
     for label, statistics in found.items():
         # Four standard errors, and the last digit.
-        within = 4 * statistics.total_regret.std() / 60**0.5 + 1
+        within = 4 * statistics.total_regret.std() / 30**0.5 + 1
         assert statistics.total_regret.mean() == pytest.approx(expected[label], abs=within), label
         assert statistics.pulls[-1] == 10_000
     if name == "bernoulli":

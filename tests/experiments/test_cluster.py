@@ -22,14 +22,14 @@ from rl_yardstick.pipeline.run import Stop
 CONSOLE = Console(quiet=True)
 
 
-def planned(root, n_seeds=3, **settings):
+def planned(root, n_seeds, **settings):
     place = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 20_000, **settings})
     agents = (AgentSpec("sarsa", "sarsa", {"engine": "interpreted"}),)
     return plan(StudySpec("s", "S", agents, (place,), n_seeds), root)
 
 
 def test_runs_of_a_worker_that_is_killed_are_done_again(tmp_path):
-    runs = planned(tmp_path)
+    runs = planned(tmp_path, 2)
     root = tmp_path.absolute()
     with ClusterWorkers("local:1", 0, root) as workers:
 
@@ -62,10 +62,8 @@ def test_a_run_that_fails_or_takes_too_long_is_not_repeated(tmp_path):
 )
 def test_workers_that_do_not_fit_are_refused(tmp_path, monkeypatch, facts, complaint):
     monkeypatch.setattr(cluster, "_facts", facts)
-    with (
-        ClusterWorkers("local:1", 0, tmp_path) as workers,
-        pytest.raises(UserError, match=complaint),
-    ):
+    refused = pytest.raises(UserError, match=complaint)
+    with ClusterWorkers("local:1", 0, tmp_path) as workers, refused:
         workers.submit(planned(tmp_path, 1)[0], "")
 
 

@@ -106,12 +106,3 @@ def test_what_was_planned_cannot_change(tmp_path):
         with pytest.raises(UserError, match="looks were planned before the first") as refusal:
             plan_of_looks(study_of(**{"agents": THREE, **changes}), tmp_path, most)
         assert words in str(refusal.value)
-
-
-@pytest.mark.parametrize(
-    ("agents", "most", "complaint"),
-    [(TWO[:1], None, "takes two agents or more"), (TWO, 9, "--max-seeds is 9, the study begins")],
-)
-def test_what_cannot_grow(tmp_path, agents, most, complaint):
-    with pytest.raises(UserError, match=complaint):
-        plan_of_looks(study_of(agents), tmp_path, most)

@@ -1,14 +1,18 @@
 """Runs in processes of their own: what fails, is killed, takes too long or is stopped."""
 
 import io
+import json
 import os
+import shutil
 import signal
 import threading
 import time
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from rl_yardstick.experiments import pool
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.pool import ERROR_FILE, Workers, do_aside, do_run, do_runs
 from rl_yardstick.experiments.results import read_results
@@ -17,53 +21,11 @@ from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import Stopped, UserError
 from rl_yardstick.pipeline.run import FAILED, FINISHED, INTERRUPTED, Run, Stop, versions
 
-# An environment of a user's own, whose episodes do what their seed says.
-WALKS = '''
-import io
-import json
-import os
-import signal
-import time
-from pathlib import Path
-
-import gymnasium as gym
-
-MARK = Path(__file__).with_name("mark")
-
-
-class Walk(gym.Env):
-    """Five places in a row; the goal is the last."""
-
-    observation_space = gym.spaces.Discrete(5)
-    action_space = gym.spaces.Discrete(2)
-    steps = 0
-    seed = None
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place, self.seed = 0, self.seed if seed is None else seed
-        return 0, {}
-
-    def step(self, action):
-        self.steps += 1
-        if self.steps == 50 and self.seed == 1:
-            raise RuntimeError("thin ice")
-        if self.steps == 50 and self.seed == 2:
-            os.kill(os.getpid(), signal.SIGKILL)
-        if self.seed == 3 and not MARK.exists():
-            time.sleep(0.02)
-        self.place = min(max(self.place + 2 * int(action) - 1, 0), 4)
-        return self.place, float(self.place == 4), self.place == 4, False, {}
-
-
-gym.register("Walk-v0", entry_point=Walk, max_episode_steps=20)
-'''
-
 
 @pytest.fixture
 def walk(own_folder):
     """Plans runs on the user's environment, one for each seed."""
-    (own_folder / "walks.py").write_text(WALKS)
+    shutil.copy(Path(__file__).with_name("walks.py"), own_folder)
     import_modules(["walks"])
 
     def planned(*seeds, n_timesteps=300):
@@ -105,8 +67,8 @@ def test_each_run_ends_for_itself_alone(walk):
 
 def test_a_run_that_takes_too_long_goes_on_later(walk, own_folder):
     _, (run,) = walk(3, n_timesteps=5000)
-    failures, _ = done([run], timeout=10.0)
-    assert failures == {3: "took longer than --run-timeout allows, 10 s"}
+    failures, _ = done([run], timeout=6.0)
+    assert failures == {3: "took longer than --run-timeout allows, 6 s"}
     assert states([run]) == [INTERRUPTED]
     assert (run.path / "state.bin").exists()
     (own_folder / "mark").touch()
@@ -115,7 +77,8 @@ def test_a_run_that_takes_too_long_goes_on_later(walk, own_folder):
     assert not (run.path / "state.bin").exists()
 
 
-def test_a_stop_leaves_no_run_running(walk):
+def test_a_stop_leaves_no_run_running(walk, monkeypatch):
+    monkeypatch.setattr(pool, "GRACE", 5.0)
     _, runs = walk(3, 4, 5, n_timesteps=20_000)
     stop = Stop()
 
@@ -146,22 +109,17 @@ def test_what_an_earlier_attempt_left_is_resumed_or_removed(tmp_path):
     (run.path / "of-an-earlier-attempt").touch()
     do_run(run)
     assert (run.path / "of-an-earlier-attempt").exists()  # it was resumed
-    written = run.path / "run.json"
     do_run(run)  # it is finished
-    rows = [
-        read_results(study, [one], tmp_path).summary.drop(
-            columns=["seconds", "cpu_seconds", "path"]
-        )
-        for one in (whole, run)
-    ]
-    assert rows[0].equals(rows[1])
+    clocks = ["seconds", "cpu_seconds", "path"]
+    one, other = (read_results(study, [each], tmp_path).summary for each in (whole, run))
+    assert one.drop(columns=clocks).equals(other.drop(columns=clocks))
     # A state of other versions, or of other settings, is of no use.
     record = run.recorded()
     for changes in (
         {"versions": {**versions(), "torch": "0.1"}},
         {"spec": {**record["spec"], "n_timesteps": 2999}},
     ):
-        written.write_text(__import__("json").dumps({**record, "state": INTERRUPTED, **changes}))
+        (run.path / "run.json").write_text(json.dumps({**record, "state": INTERRUPTED, **changes}))
         (run.path / "state.bin").write_bytes(state)
         (run.path / "of-an-earlier-attempt").touch()
         do_run(run)

@@ -22,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +40,6 @@ def main() -> int:
     """Record, or compare; the exit code."""
     arguments = _parse()
     found = look(arguments.root, arguments.only)
-    if arguments.seconds:
-        for name, spent in sorted(found.seconds.items(), key=lambda item: -item[1])[:30]:
-            print(f"{spent:7.2f} s  {name}")
     print(f"{len(found.values)} entries, {sum(found.seconds.values()):.0f} s of processor time")
     if arguments.record:
         record(found, arguments.only)
@@ -90,16 +87,8 @@ def facts() -> dict[str, str]:
         "python": ".".join(platform.python_version_tuple()[:2]),
         "machine": f"{platform.system()} {platform.machine()}",
         "capability": th.backends.cpu.get_cpu_capability(),
-        **{name: installed(name) for name in LIBRARIES},
+        **{name: version(name) for name in LIBRARIES},
     }
-
-
-def installed(library: str) -> str:
-    """The version of a library; ``none`` where it is not there."""
-    try:
-        return version(library)
-    except PackageNotFoundError:
-        return "none"
 
 
 def record(found: Found, patterns: list[str]) -> None:
@@ -187,7 +176,6 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--root", type=Path, default=ROOT, help="another checkout than this one")
     parser.add_argument("--record", action="store_true", help=f"write {GOLDEN.name}")
     parser.add_argument("--only", nargs="+", default=["*"], metavar="NAME", help="patterns")
-    parser.add_argument("--seconds", action="store_true", help="what took longest")
     return parser.parse_args()
 
 

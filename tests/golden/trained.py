@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,17 +19,9 @@ N_STEPS = 1000
 
 # What is trained on beside all environments of the project.
 OTHER_ENVIRONMENTS = (
-    "Acrobot-v1",
-    "Blackjack-v1",
-    "CartPole-v1",
-    "CliffWalking-v1",
-    "CliffWalkingSlippery-v1",
-    "FrozenLake-v1",
-    "FrozenLake8x8-v1",
-    "MountainCar-v0",
-    "MountainCarContinuous-v0",
-    "Pendulum-v1",
-    "Taxi-v4",
+    *("Acrobot-v1", "Blackjack-v1", "CartPole-v1", "CliffWalking-v1", "CliffWalkingSlippery-v1"),
+    *("FrozenLake-v1", "FrozenLake8x8-v1", "MountainCar-v0", "MountainCarContinuous-v0"),
+    *("Pendulum-v1", "Taxi-v4"),
 )
 # Its first two columns are the contexts: numbers, so that linear agents fit too.
 LOG = "".join(
@@ -45,14 +36,8 @@ ENVIRONMENT_ARGUMENTS: dict[str, dict[str, Any]] = {
 # Agents of a table whose arithmetic is the same on every processor: sums, products, comparisons.
 EXACT_EVERYWHERE = (
     *("double_qlearning", "dyna_q", "epsilon_greedy", "expected_sarsa", "monte_carlo"),
-    *(
-        "n_step_sarsa",
-        "n_step_tree_backup",
-        "off_policy_monte_carlo",
-        "optimal",
-        "policy_iteration",
-    ),
-    *("q_lambda", "qlearning", "random", "sarsa", "sarsa_lambda"),
+    *("n_step_sarsa", "n_step_tree_backup", "off_policy_monte_carlo", "optimal"),
+    *("policy_iteration", "q_lambda", "qlearning", "random", "sarsa", "sarsa_lambda"),
     "value_iteration",
 )
 # Environments whose steps or models come from more than that: sines, logarithms, exponentials.
@@ -177,10 +162,8 @@ def environments() -> list[str]:
 
 
 def package(name: str) -> Any:
-    """A package of the checkout that is looked at; early commits have it at the top."""
-    # Not by trying: another checkout, whose packages are installed, would take its place.
-    is_inside = (Path(os.environ["PYTHONPATH"]) / "rl_yardstick").is_dir()
-    return importlib.import_module(f"rl_yardstick.{name}" if is_inside else name)
+    """A package of the checkout that is looked at."""
+    return importlib.import_module(f"rl_yardstick.{name}")
 
 
 def fitting(env_id: str, arguments: dict[str, Any]) -> list[str]:

@@ -1,49 +1,56 @@
-"""What an agent is trained on and evaluated on: arguments, limits, wrappers, files."""
+"""What settings name: classes and modules of admitted kinds alone, and environments."""
+
+import math
+import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3.common.buffers import BaseBuffer
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import nn, optim
 
 from rl_yardstick.envs.wrappers import OneHotObservation, ScaleReward, TerminationReward
+from rl_yardstick.pipeline.components import (
+    build,
+    build_value,
+    find_class,
+    import_modules,
+    module_name,
+)
 from rl_yardstick.pipeline.environments import (
     EVALUATION_TIME_LIMIT,
     evaluation_kwargs,
     make_evaluation_env,
     make_single_env,
     make_training_env,
-    map_name,
     training_changes,
     training_kwargs,
     with_files_read,
 )
 from rl_yardstick.pipeline.errors import UserError
-from tests.pipeline.short_runs import spec_of as spec_for
+from rl_yardstick.pipeline.spec import Component
+from rl_yardstick.pipeline.training import make_agent
+from tests.pipeline.short_runs import CART, spec_of
 
 
-def spec_of(env_id, entry=None):
-    return spec_for("random", env_id, entry)
+def world(env_id, entry=None):
+    return spec_of("random", env_id, entry)
 
 
 def layers(env):
-    """The classes around an environment, the outermost first."""
-    classes = [type(env)]
-    while env is not env.unwrapped:
-        env = env.env
-        classes.append(type(env))
-    return classes
+    """An environment and what is in it, the outermost first."""
+    found = [env]
+    while found[-1] is not env.unwrapped:
+        found.append(found[-1].env)
+    return found
 
 
 def time_limit(env):
-    while env is not env.unwrapped:
-        if isinstance(env, gym.wrappers.TimeLimit):
-            return env._max_episode_steps
-        env = env.env
-    return None
-
-
-# --- arguments -----------------------------------------------------------------------------------
+    limits = (each for each in layers(env) if isinstance(each, gym.wrappers.TimeLimit))
+    return next((each._max_episode_steps for each in limits), None)
 
 
 ENTRY = {
@@ -54,7 +61,7 @@ ENTRY = {
 
 
 def test_which_arguments_reach_training_and_which_evaluation(tmp_path):
-    spec = spec_of("Warehouse-v0", {**ENTRY, "n_envs": 2})
+    spec = world("Warehouse-v0", {**ENTRY, "n_envs": 2})
     shared = {"step_reward": -2}
     own = {"goal_reward": 60, "random_start": True, "max_episode_steps": 30}
     assert training_kwargs(spec) == {**shared, **own}
@@ -80,8 +87,6 @@ def test_which_arguments_reach_training_and_which_evaluation(tmp_path):
 
 SHAPED = {"shelf_reward": -10}
 SCALED = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.01}}
-
-
 UNLIMITED = {"max_episode_steps": -1}
 
 
@@ -104,31 +109,22 @@ UNLIMITED = {"max_episode_steps": -1}
     ],
 )
 def test_what_training_changes(entry, changes):
-    assert training_changes(spec_of("Warehouse-v0", entry)) == changes
+    assert training_changes(world("Warehouse-v0", entry)) == changes
 
 
-# --- time limits ---------------------------------------------------------------------------------
+def test_evaluation_always_has_a_time_limit():
+    """Where one is taken away, training may go on without end."""
+    for env_id, entry, limit in (
+        ("CliffWalking-v1", {}, EVALUATION_TIME_LIMIT),
+        ("CartPole-v1", {"train_env_kwargs": UNLIMITED}, 500),
+        ("CartPole-v1", {"env_kwargs": UNLIMITED}, EVALUATION_TIME_LIMIT),
+    ):
+        spec = world(env_id, entry)
+        made = make_single_env(spec, training=True), make_training_env(spec, None).envs[0]
+        assert [time_limit(env) for env in made] == [None] * 2
+        made = make_single_env(spec), make_evaluation_env(spec, 1).envs[0]
+        assert [time_limit(env) for env in made] == [limit] * 2
 
-
-@pytest.mark.parametrize(
-    ("env_id", "entry", "training", "evaluation"),
-    [
-        # Without a limit of its own.
-        ("CliffWalking-v1", {}, None, EVALUATION_TIME_LIMIT),
-        # Taken away: training may go on without end, evaluation must not.
-        ("CartPole-v1", {"train_env_kwargs": {"max_episode_steps": -1}}, None, 500),
-        ("CartPole-v1", {"env_kwargs": {"max_episode_steps": -1}}, None, EVALUATION_TIME_LIMIT),
-    ],
-)
-def test_evaluation_always_has_a_time_limit(env_id, entry, training, evaluation):
-    spec = spec_of(env_id, entry)
-    made = make_single_env(spec, training=True), make_training_env(spec, None).envs[0]
-    assert [time_limit(env) for env in made] == [training] * 2
-    made = make_single_env(spec), make_evaluation_env(spec, 1).envs[0]
-    assert [time_limit(env) for env in made] == [evaluation] * 2
-
-
-# --- wrappers ------------------------------------------------------------------------------------
 
 WRAPPED = {
     "env_wrapper": [
@@ -140,16 +136,16 @@ WRAPPED = {
 
 
 def test_wrappers_stand_in_their_order():
-    spec = spec_of("FrozenLake-v1", WRAPPED)
+    spec = world("FrozenLake-v1", WRAPPED)
     both = [OneHotObservation, TerminationReward]
     training, evaluation = make_training_env(spec, None), make_evaluation_env(spec, 1)
     # Monitor is inside: it records the rewards of the environment itself.
-    assert layers(training.envs[0])[:4] == [ScaleReward, *both, Monitor]
-    assert layers(evaluation.envs[0])[:3] == [*both, Monitor]
+    kinds = [[type(each) for each in layers(env.envs[0])] for env in (training, evaluation)]
+    assert (kinds[0][:4], kinds[1][:3]) == ([ScaleReward, *both, Monitor], [*both, Monitor])
     assert training.observation_space.shape == evaluation.observation_space.shape == (16,)
     # Rewards are changed for training, and recorded unchanged.
     scaled = {"env_kwargs": {"desc": ["SG"]}, "train_env_wrapper": WRAPPED["train_env_wrapper"]}
-    spec = spec_of("Warehouse-v0", scaled)
+    spec = world("Warehouse-v0", scaled)
     made = {50.0: make_training_env(spec, None), 100.0: make_evaluation_env(spec, 1)}
     for reward, env in made.items():
         env.reset()
@@ -157,11 +153,8 @@ def test_wrappers_stand_in_their_order():
         assert (rewards[0], dones[0], infos[0]["episode"]["r"]) == (reward, True, 100.0)
 
 
-# --- vectorised environments ---------------------------------------------------------------------
-
-
 def test_normalisation_learns_in_training_alone_and_rewards_are_evaluated_as_they_are():
-    spec = spec_for("ppo", "CartPole-v1", {"normalize": True, "gamma": 0.9, "n_envs": 2})
+    spec = spec_of("ppo", "CartPole-v1", {"normalize": True, "gamma": 0.9, "n_envs": 2})
     env, eval_env = make_training_env(spec, None), make_evaluation_env(spec, 1)
     for made, trains in ((env, True), (eval_env, False)):
         assert (made.norm_obs, made.norm_reward, made.training) == (True, trains, trains)
@@ -171,72 +164,166 @@ def test_normalisation_learns_in_training_alone_and_rewards_are_evaluated_as_the
     before = statistics.mean.copy()
     assert [eval_env.step([0])[1][0] for _ in range(5)] == [1.0] * 5
     np.testing.assert_array_equal(statistics.mean, before)
-    plain = make_training_env(spec_of("CartPole-v1", {"normalize": False}), None)
+    plain = make_training_env(world("CartPole-v1", {"normalize": False}), None)
     assert type(plain) is DummyVecEnv
 
 
-MISTAKES = [
-    (
-        "FrozenLake-v1",
-        {"slippery": True},
-        "unknown argument 'slippery': did you mean 'is_slippery'?",
-    ),
-    ("FrozenLake-v1", {"map_name": "9x9"}, "there is no '9x9' (with map_name='9x9')"),
-    ("Warehouse-v0", {"slip": 2}, "slip must be a finite number from 0 to 1, not 2"),
-    ("Warehouse-v0", {"desc": []}, "the map is empty (with desc=[])"),
+def test_a_maps_rows_take_the_place_of_its_path_and_a_log_is_found_from_other_folders(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
+    for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
+        settings = {"gamma": 0.9, key: {"desc": "map.txt", "slip": 0.1}}
+        read = {"gamma": 0.9, key: {"desc": ["S..", ".#.", "..G"], "slip": 0.1}}
+        for each in (settings, read):
+            assert with_files_read("Warehouse-v0", each) == read
+        assert settings[key]["desc"] == "map.txt"
+    assert with_files_read("FrozenLake-v1", settings) == settings
+    settings = {"env_kwargs": {"log": "pulls.csv"}, "eval_env_kwargs": {"log": "/a.csv"}}
+    found = with_files_read("ReplayBandit-v0", settings)
+    assert found == {**settings, "env_kwargs": {"log": str(tmp_path / "pulls.csv")}}
+
+
+KINDS = (nn.Module, optim.Optimizer, BaseBuffer)
+CALLBACKS = "stable_baselines3.common.callbacks"
+
+NAMES = [
+    ("nn.Tanh", "Tanh"),
+    ("torch.nn.modules.activation.ReLU", "ReLU"),
+    ("th.optim.Adam", "Adam"),
+    ("RMSpropTFLike", "RMSpropTFLike"),
+    ("nn.Tahn", "Tahn does not exist: did you mean 'Tanh'"),
+    ("nn.functional.relu", "is no Module or Optimizer or BaseBuffer"),
+    ("th.load", "is in none of the packages"),
+    ("os.system", "is in none of the packages"),
+    ("rl_zoo3.utils.get_class_by_name", "is in none of the packages"),
+    ("gymnasium.wrapers.TimeLimit", "No module named 'gymnasium.wrapers'"),
+    ("print", "is in none of the packages"),
 ]
 
 
-@pytest.mark.parametrize(("env_id", "kwargs", "complaint"), MISTAKES)
-def test_a_mistaken_argument_is_told_in_a_line(env_id, kwargs, complaint):
-    with pytest.raises(UserError) as refused:
-        make_single_env(spec_of(env_id, {"env_kwargs": kwargs}), training=True)
-    assert str(refused.value) == f"{env_id}: {complaint}"
+@pytest.mark.parametrize(("name", "found"), NAMES)
+def test_which_names_are_classes(name, found):
+    if found in name:
+        assert find_class(name, KINDS, "here", []).__name__ == found
+    else:
+        with pytest.raises(UserError, match=r"^here: ") as caught:
+            find_class(name, KINDS, "here", [])
+        assert found in str(caught.value)
 
 
-# --- files that arguments name -------------------------------------------------------------------
-
-ROWS = ["S..", ".#.", "..G"]
-
-
-@pytest.fixture
-def map_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
-
-
-@pytest.mark.usefixtures("map_file")
-def test_a_maps_rows_take_the_place_of_its_path():
-    env_id = "Warehouse-v0"
-    for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
-        settings = {"gamma": 0.9, key: {"desc": "map.txt", "slip": 0.1}}
-        read = {"gamma": 0.9, key: {"desc": ROWS, "slip": 0.1}}
-        assert with_files_read(env_id, settings) == with_files_read(env_id, read) == read
-        assert settings[key]["desc"] == "map.txt"
-    assert with_files_read("FrozenLake-v1", settings) == settings
-    with pytest.raises(UserError, match=r"Warehouse-v0: desc: cannot read the map file no\.txt"):
-        with_files_read("Warehouse-v0", {"env_kwargs": {"desc": "no.txt"}, "eval_env_kwargs": None})
+COMPONENTS = [
+    (gym.Wrapper, "gymnasium.wrappers.TimeLimit", {}, "max_episode_steps"),
+    (gym.Wrapper, "gymnasium.wrappers.TimeLimit", {"max_steps": 5}, "unknown argument 'max_steps'"),
+    (gym.Wrapper, "gymnasium.make", {}, "gymnasium.make is no Wrapper"),
+    (gym.Wrapper, "gymnasium.wrappers.TimeLimt", {}, "did you mean 'TimeLimit'"),
+    (gym.Wrapper, "minigrid.wrappers.FlatObsWrapper", {}, "admit others with --gym-packages"),
+    (BaseCallback, f"{CALLBACKS}.CheckpointCallback", {}, "save_freq"),
+    (BaseCallback, f"{CALLBACKS}.BaseCallback", {}, "callback"),
+    (BaseCallback, "stable_baselines3.common.monitor.Monitor", {}, "Monitor is no BaseCallback"),
+]
 
 
-def test_a_maps_name_is_that_of_the_file_that_is_evaluated_on():
-    path, other, rows = {"desc": "maps/depot.txt"}, {"desc": "b.txt"}, {"desc": "S.\n.G"}
-    for kwargs, expected in (
-        ({"env_kwargs": path}, "depot.txt"),
-        ({"env_kwargs": path, "eval_env_kwargs": other}, "b.txt"),
-        ({"env_kwargs": path, "eval_env_kwargs": {"slip": 0.1}}, "depot.txt"),
-        ({"env_kwargs": path, "eval_env_kwargs": {"desc": ["SG"]}}, ""),
-        ({"train_env_kwargs": path}, ""),
-        ({"env_kwargs": rows}, ""),
-        ({}, ""),
+@pytest.mark.parametrize(("base", "name", "kwargs", "said"), COMPONENTS)
+def test_components_that_are_wrong(base, name, kwargs, said, tmp_path):
+    inner = [] if base is BaseCallback else [gym.make(CART)]
+    with pytest.raises(UserError) as caught:
+        build(Component(name=name, kwargs=kwargs), base, "callback", [], tmp_path, *inner)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_callbacks_write_into_the_run_folder_alone(tmp_path):
+    def made(name, **kwargs):
+        component = Component(name=f"{CALLBACKS}.{name}", kwargs=kwargs)
+        return build(component, BaseCallback, "callback", [], tmp_path)
+
+    assert isinstance(made("StopTrainingOnMaxEpisodes", max_episodes=5), StopTrainingOnMaxEpisodes)
+    assert made("CheckpointCallback", save_freq=10).save_path == str(tmp_path)
+    inside = made("CheckpointCallback", save_freq=10, save_path="elsewhere")
+    assert inside.save_path == str(tmp_path / "elsewhere")
+    (tmp_path / "link").symlink_to(tmp_path.parent)
+    for place in ("/etc/x", "..", "a/../../x", "link/x"):
+        with pytest.raises(UserError, match="save_path must lie inside the run folder"):
+            made("CheckpointCallback", save_freq=10, save_path=place)
+    with pytest.raises(UserError, match="name_prefix begins the names of files"):
+        made("CheckpointCallback", save_freq=10, name_prefix="../x")
+
+
+def test_arguments_make_an_agent():
+    kwargs = {
+        "net_arch": {"pi": [8], "vf": [16]},
+        "activation_fn": "nn.ELU",
+        "optimizer_class": "th.optim.Adam",
+        "optimizer_kwargs": {"fused": True},  # a setting of the library's
+    }
+    entry = {"learning_rate": "lin_1e-3", "n_steps": "64", "policy_kwargs": kwargs, "n_envs": 1}
+    model = make_agent(spec_of("ppo", CART, entry), None)
+    assert isinstance(model.policy.mlp_extractor.policy_net[1], nn.ELU)
+    assert model.policy.mlp_extractor.value_net[0].out_features == 16
+    assert isinstance(model.policy.optimizer, optim.Adam)
+    assert model.policy.optimizer.defaults["fused"] is True
+    assert math.isclose(model.lr_schedule(0.5), 5e-4)
+    assert build_value([{"a": "no.such.name-"}], "here", []) == [{"a": "no.such.name-"}]
+    # Gaussian noise on the values of a table, which no key of the file format may swallow.
+    entry = {"exploration": "gaussian_noise", "noise_std": 0.25}
+    assert make_agent(spec_of("qlearning", entry=entry), None).noise_std == 0.25
+
+
+MODULE = """
+import gymnasium as gym
+import numpy as np
+from {beside} import STEP
+
+class Own(gym.Env):
+    observation_space, action_space = gym.spaces.Discrete(2), gym.spaces.Discrete(2)
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {{}}
+    def step(self, action):
+        return STEP, 1.0, True, False, {{}}
+
+class Twice(gym.RewardWrapper):
+    def reward(self, reward):
+        return 2 * reward
+
+gym.register("{name}-v0", Own, max_episode_steps=5)
+"""
+
+
+@pytest.mark.parametrize("how", ["name", "file", "package"])
+def test_modules_that_were_typed(own_folder, monkeypatch, how):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    name, beside = f"mine_{how}", f"beside_{how}"
+    folder = own_folder / ("there" if how == "file" else "")
+    folder.mkdir(exist_ok=True)
+    (folder / f"{beside}.py").write_text("STEP = 1\n")
+    text = MODULE.format(name=name, beside=beside)
+    if how == "package":
+        (own_folder / name).mkdir()
+        (own_folder / name / "__init__.py").write_text(text)
+    else:
+        (folder / f"{name}.py").write_text(text)
+    typed = f"there/{name}.py" if how == "file" else name
+    import_modules([typed])
+    assert module_name(typed) == name
+    wrapper = {f"{name}.Twice": {}}
+    spec = spec_of("qlearning", f"{name}-v0", {"env_wrapper": wrapper}, gym_packages=[typed])
+    env = make_training_env(spec, None)
+    env.reset()
+    assert env.step([0])[1].tolist() == [2.0]
+    with pytest.raises(UserError, match="admit others with --gym-packages"):
+        make_training_env(spec.changed(gym_packages=[]), None)
+
+
+def test_modules_that_cannot_be_imported(own_folder, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (own_folder / "failing.py").write_text("x = 1\nraise ValueError('no')\n")
+    (own_folder / "leaving.py").write_text("raise SystemExit(3)\n")
+    for typed, said in (
+        ("failing", r"failing\.py:2: no"),
+        ("leaving.py", r"leaving\.py:1: 3"),
     ):
-        assert map_name("Warehouse-v0", kwargs) == expected, kwargs
-    assert map_name("CartPole-v1", {"env_kwargs": path}) == ""
-
-
-@pytest.mark.usefixtures("map_file")
-def test_a_log_is_found_from_other_folders(tmp_path):
-    settings = {"env_kwargs": {"log": "pulls.csv"}, "eval_env_kwargs": {"log": "/a.csv"}}
-    found = with_files_read("ReplayBandit-v0", settings)
-    place = str(tmp_path / "pulls.csv")
-    assert found == {"env_kwargs": {"log": place}, "eval_env_kwargs": {"log": "/a.csv"}}
-    assert with_files_read("FrozenLake-v1", settings) == settings
+        with pytest.raises(UserError, match=said):
+            import_modules([typed])

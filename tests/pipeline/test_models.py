@@ -39,9 +39,8 @@ def fallen(progress):
 
 
 def train_to(folder, algo, entry, n_timesteps=200, **fields):
-    return run_of(spec_of(algo, CART, entry, n_timesteps=n_timesteps, **BRIEFLY, **fields), folder)[
-        0
-    ]
+    spec = spec_of(algo, CART, entry, n_timesteps=n_timesteps, **BRIEFLY, **fields)
+    return run_of(spec, folder)[0]
 
 
 def read(path):
@@ -51,9 +50,6 @@ def read(path):
 def seen(path):
     """How many observations the statistics are of, the start of 1e-4 left out."""
     return round(read(path).obs_rms.count)
-
-
-# --- which model ----------------------------------------------------------------------------------
 
 
 def test_which_model_of_which_run(tmp_path):
@@ -78,9 +74,9 @@ def test_which_model_of_which_run(tmp_path):
     ):
         with pytest.raises(UserError, match=said):
             find_model(wanted)
-
-
-# --- statistics of normalisation ------------------------------------------------------------------
+    (runs[0].path / "run.json").write_text("{}")
+    with pytest.raises(UserError, match=r"no run folder of this version: run\.json has no spec"):
+        find_model(Wanted(Path(runs[0].path)))
 
 
 @pytest.fixture(scope="module")
@@ -114,16 +110,6 @@ def test_statistics_go_on_unless_the_new_entry_has_none(normalised, tmp_path):
     assert run.spec().normalize["clip_obs"] == 3.0
 
 
-def test_statistics_beside_a_model_that_was_trained_without_are_not_used(normalised, tmp_path):
-    run = train_to(tmp_path, "a2c", SMALL_A2C, 40)
-    content = (normalised.path / CART / "vecnormalize.pkl").read_bytes()
-    (run.path / CART / "vecnormalize.pkl").write_bytes(content)
-    assert find_model(Wanted(run.path)).statistics is None
-
-
-# --- replay buffers -------------------------------------------------------------------------------
-
-
 def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tmp_path):
     fields = {"save_replay_buffer": True, "eval_freq": -1}
     first = train_to(tmp_path / "first", "dqn", SMALL_DQN, save_freq=80, **fields)
@@ -154,7 +140,6 @@ def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tm
     env.close()
 
 
-# --- agents of others: rl_zoo3's layout and a model hub's, made with the library alone -----------
 CONFIG = OrderedDict(
     frame_stack=2,
     learning_rate="lin_0.1",
@@ -287,10 +272,3 @@ def test_a_setting_that_is_code_is_refused_with_a_way_out(tmp_path, key):
     with pytest.raises(UserError) as refused:
         load(spec_of("ppo", CART), tmp_path / "model.zip", None, device="cpu")
     assert str(refused.value).endswith(end)
-
-
-def test_a_record_without_a_spec_is_told(tmp_path):
-    run = train_to(tmp_path, "a2c", SMALL_A2C, 40)
-    (run.path / "run.json").write_text("{}")
-    with pytest.raises(UserError, match=r"no run folder of this version: run\.json has no spec"):
-        find_model(Wanted(Path(run.path)))

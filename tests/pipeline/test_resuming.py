@@ -40,7 +40,7 @@ def row(env_id, algo, steps, settings=None, **fields):
 # One for each place in which something is kept between two steps: what an engine hands over, an
 # agent's own memory, a library's buffers, noise and statistics, and those of callbacks and logs.
 TRAININGS = [
-    row(LAKE, "qlearning", 600, {**COMPILED, **FINE}),
+    row(LAKE, "qlearning", 600, {**COMPILED, **FINE}, diagnose=True),
     row(LAKE, "sarsa", 600, {"engine": "interpreted", "n_envs": 2}),
     row(LAKE, "n_step_sarsa", 600, {**COMPILED, "n_envs": 3}),
     row(LAKE, "prioritized_sweeping", 600, {"initial_q_std": 1.0, "n_envs": 2}),
@@ -73,8 +73,8 @@ def spec_of(env_id, algo, steps, settings, **fields):
     return read_spec(algo, env_id, override(entry, changes), seed=3, pictures=False, **fields)
 
 
-def cut_off(spec, monkeypatch, share=0.4, folder="parts"):
-    """A run that is stopped after a share of its steps, or of its episodes."""
+def cut_off(spec, monkeypatch, share=0.4, run=None):
+    """A new run, or one that is resumed, stopped after a share of its steps or episodes."""
     save, stopped = StateCallback._on_rollout_start, []
 
     def until(self):
@@ -87,7 +87,7 @@ def cut_off(spec, monkeypatch, share=0.4, folder="parts"):
     with monkeypatch.context() as patch:
         patch.setattr(StateCallback, "_on_rollout_start", until)
         with pytest.raises(Stopped):
-            run_of(spec, folder)
+            resumed(run) if run else run_of(spec, "parts")
     run = Run(stopped[0].path)
     assert run.recorded()["state"] == "interrupted"
     assert run.state_path.exists()
@@ -166,18 +166,7 @@ def test_the_result_is_that_of_an_undisturbed_run(
 def test_a_run_that_is_cut_off_twice(monkeypatch):
     spec = spec_of(LAKE, "qlearning", 600, {})
     whole, _ = run_of(spec, "whole")
-    run = cut_off(spec, monkeypatch, 0.2)
-    save = StateCallback._on_rollout_start
-
-    def again(self):
-        if not self.resumes and self.model.num_timesteps > 350:
-            self.run.stop.number = signal.SIGINT
-        save(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(StateCallback, "_on_rollout_start", again)
-        with pytest.raises(Stopped):
-            resumed(run)
+    run = cut_off(spec, monkeypatch, 0.6, cut_off(spec, monkeypatch, 0.2))
     assert_same(whole, resumed(run))
 
 
@@ -189,8 +178,8 @@ StateCallback.share_of_time, StateCallback.shortest_pause = 1e9, 0.0
 old = StateCallback._on_rollout_start
 def new(self):
     old(self)
-    if self.model.num_timesteps > {at}:
-        os.kill(os.getpid(), signal.SIG{name})
+    if self.model.num_timesteps > 500:
+        os.kill(os.getpid(), signal.SIGKILL)
 StateCallback._on_rollout_start = new
 import sys
 sys.argv = ["train.py", *{words!r}]
@@ -198,20 +187,17 @@ run_command("train")
 """
 
 
-@pytest.mark.parametrize(("name", "code"), [("KILL", -9), ("INT", 130), ("TERM", 143)])
-def test_a_process_that_is_ended_by_a_signal(tmp_path, name, code):
+def test_a_process_that_is_killed(tmp_path, typed):
+    """Signals that a process sees are sent to whole commands, see ``tests/commands``."""
     words = ["--env", CART, "--algo", "ppo", "-n", "1200", "--seed", "3", "--eval-episodes", "2"]
     words += ["-params", "n_envs:1", "n_steps:128", "batch_size:64", "n_epochs:1", "--verbose", "0"]
-
-    def ended(at, name, *words):
-        script = KILLED.format(at=at, name=name, words=[*words])
-        return subprocess.run([sys.executable, "-c", script], check=False, timeout=250).returncode
-
-    assert ended(10**9, "INT", *words, "-f", "whole") == 0
-    assert ended(500, name, *words, "-f", "parts") == code
+    assert typed("train.py", *words, "-f", "whole")[0] == 0
+    script = KILLED.format(words=[*words, "-f", "parts"])
+    done = subprocess.run([sys.executable, "-c", script], check=False, timeout=250)
+    assert done.returncode == -signal.SIGKILL
     (run,) = (Run(path) for path in tmp_path.glob("parts/ppo/*"))
-    assert run.recorded()["state"] == ("running" if name == "KILL" else "interrupted")
-    assert ended(10**9, "INT", "--resume", str(run.path), "--verbose", "0") == 0
+    assert run.recorded()["state"] == "running"
+    assert typed("train.py", "--resume", run.path, "--verbose", "0")[0] == 0
     whole = Run(tmp_path / "whole" / run.path.relative_to(tmp_path / "parts"))
     names = ["CartPole-v1.zip", "best_model.zip", "evaluations.npz", "0.monitor.csv"]
     for each in names:

@@ -1,22 +1,26 @@
-"""Run folders: names, locks, records, stops; files that are read with a limit and written whole."""
+"""Run folders and trainings: names, locks, records, stops, files; evaluations; what fails."""
 
 import json
 import math
 import os
+import resource
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
+from gymnasium import spaces
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rl_yardstick.pipeline import files
 from rl_yardstick.pipeline.callbacks import EvaluationCallback
 from rl_yardstick.pipeline.errors import Stopped, UserError
+from rl_yardstick.pipeline.evaluation import sampled
 from rl_yardstick.pipeline.files import (
     json_text,
     portable_name,
@@ -26,17 +30,15 @@ from rl_yardstick.pipeline.files import (
     replacing,
     write_json,
 )
-from rl_yardstick.pipeline.run import Run, Stop, numbered_runs, statistics_beside
+from rl_yardstick.pipeline.run import Run, Stop, numbered_runs
 from rl_yardstick.pipeline.training import train
-from tests.pipeline.short_runs import LAKE, run_of, spec_of
+from tests.pipeline.short_runs import CART, LAKE, run_of, spec_of, trained
 
 
 @pytest.fixture(autouse=True)
 def own_place(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-# --- names and locks ------------------------------------------------------------------------------
+    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 200)
 
 
 def test_numbers_are_given_once_and_the_newest_is_last():
@@ -85,28 +87,11 @@ def test_the_folder_has_the_layout_of_rl_zoo3():
         *("0.monitor.csv", ".lock", *(f"rl_model_{n}_steps.zip" for n in (100, 200, 300))),
     } - ({".lock"} - names)
     assert list(run.checkpoints()) == [100, 200, 300]
-    assert run.spec().hyperparams == {**entry, "policy": run.spec().algorithm.get("policy")} or (
-        run.spec().hyperparams == entry
-    )
+    assert run.spec().hyperparams == entry
     record = run.recorded()
     assert (record["state"], record["n_timesteps"]) == ("finished", 300)
     assert record["final"]["mean_return"] == outcome.final.mean_return
     assert np.load(run.path / "evaluations.npz")["timesteps"].tolist() == [100, 200, 300]
-
-
-@pytest.mark.parametrize(
-    ("model", "statistics"),
-    [
-        ("a/FrozenLake-v1.zip", "a/FrozenLake-v1/vecnormalize.pkl"),
-        ("a/best_model.zip", "a/best_model_vecnormalize.pkl"),
-        ("a/rl_model_300_steps.zip", "a/rl_model_vecnormalize_300_steps.pkl"),
-    ],
-)
-def test_where_statistics_lie(model, statistics):
-    assert statistics_beside(Path(model)) == Path(statistics)
-
-
-# --- stops ----------------------------------------------------------------------------------------
 
 
 def test_the_first_signal_is_a_number_and_the_second_ends_at_once():
@@ -116,23 +101,11 @@ def test_the_first_signal_is_a_number_and_the_second_ends_at_once():
     signal.raise_signal(signal.SIGTERM)
     with pytest.raises(Stopped) as stopped:
         stop.check()
-    assert stopped.value.number == signal.SIGTERM
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
     for number, handler in before.items():
         signal.signal(number, handler)
-
-
-def test_a_stop_before_the_first_step_leaves_no_folder():
-    spec = spec_of("qlearning", n_timesteps=1000)
-    run = Run.claim(Path("logs"), spec)
-    run.stop.number = signal.SIGINT
-    with pytest.raises(Stopped), run:
-        train(spec, run)
-    assert run.recorded().get("state") == "interrupted" or not run.path.exists()
-
-
-# --- failures of a training -----------------------------------------------------------------------
+    assert stopped.value.number == signal.SIGTERM
 
 
 def test_an_error_is_recorded_and_what_was_written_stays(monkeypatch):
@@ -156,22 +129,21 @@ def test_an_error_is_recorded_and_what_was_written_stays(monkeypatch):
     assert (run.path / "best_model.zip").exists()
 
 
-# --- files ----------------------------------------------------------------------------------------
-
-
-def test_a_file_has_its_name_when_it_is_whole(tmp_path, small_disk):
+def test_a_file_has_its_name_when_it_is_whole(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("before")
     with pytest.raises(ZeroDivisionError), replacing(path) as beside:
         beside.write_text(f"half {beside.suffix == '.txt'}: {1 / 0}")
     assert path.read_text() == "before"
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    handler, limits = signal.getsignal(signal.SIGXFSZ), resource.getrlimit(resource.RLIMIT_FSIZE)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))  # as if the disk were full
     try:
-        too_large = pytest.raises(OSError, match="File too large")
-        with small_disk(10), too_large as full, replacing(path) as beside:
+        with pytest.raises(OSError, match="File too large") as full, replacing(path) as beside:
             beside.write_bytes(bytes(1000))
     finally:
-        signal.signal(signal.SIGXFSZ, before)
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
     assert full.value.filename == str(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.txt"]
 
@@ -195,6 +167,7 @@ def test_only_regular_files_of_moderate_size_are_read(tmp_path):
     assert time.monotonic() - begun < 20
 
 
+@settings(max_examples=40)
 @given(st.text(min_size=1))
 def test_a_portable_name_is_one_and_stays_one(name):
     found = portable_name(name)
@@ -209,3 +182,116 @@ def test_json_has_no_nan_and_keeps_infinity(tmp_path):
     read = json.loads((tmp_path / "a.json").read_text())
     assert read == {"a": 0.1, "b": [None, -math.inf], "c": [0, 1], "3": None}
     assert json_text(math.inf) == "1e999"
+
+
+SMALL_PPO = {"n_steps": 32, "batch_size": 16, "n_epochs": 1, "n_envs": 1}
+
+
+@pytest.mark.parametrize(
+    ("entry", "fields", "steps"),
+    [
+        ({"n_envs": 4}, {"eval_freq": 250}, [248, 496, 744, 992]),
+        ({}, {}, list(range(50, 1001, 50))),
+        ({}, {"eval_freq": 5000}, [1000]),  # at the end, if at no other time
+        ({}, {"eval_freq": -1}, None),
+    ],
+)
+def test_when_evaluations_come(entry, fields, steps):
+    run, outcome = trained("qlearning", LAKE, entry, n_timesteps=1000, **fields)
+    path = run.path / "evaluations.npz"
+    assert (steps is None) == (outcome.final is None) == (not path.exists())
+    if steps is not None:
+        assert np.load(path)["timesteps"].tolist() == steps
+        assert outcome.best_timesteps in steps
+
+
+class Sick(gym.Env):
+    """Returns a wrong number, or raises an error, at its 30th step."""
+
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+    action_space = spaces.Discrete(2)
+    fault = None
+
+    def __init__(self, fault="reward"):
+        self.fault, self.n_steps = fault, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        is_time = self.n_steps == 30
+        if is_time and self.fault == "error":
+            raise RuntimeError("the motor is broken")
+        if is_time and self.fault == "exit":
+            raise SystemExit("enough")
+        obs = np.full(2, np.nan if is_time and self.fault == "observation" else 0, np.float32)
+        reward = float("inf") if is_time and self.fault == "reward" else 1.0
+        return obs, reward, self.n_steps % 10 == 0, False, {}
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "said"),
+    [
+        ("reward", UserError, "reward of environment 0 at step 30 is inf"),
+        ("observation", UserError, "observation of an episode of environment 0 at step 30 is nan"),
+        ("error", RuntimeError, "the motor is broken"),  # of the user's own code, as it is
+        ("exit", SystemExit, "enough"),
+    ],
+)
+def test_what_an_environment_does_wrong(fault, kind, said, monkeypatch):
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    monkeypatch.setattr(gym, "registry", gym.envs.registration.registry)
+    gym.register("Sick-v0", Sick, max_episode_steps=50, kwargs={"fault": fault})
+    spec = spec_of("ppo", "Sick-v0", SMALL_PPO, n_timesteps=64, eval_freq=16, eval_episodes=1)
+    run = Run.claim(Path("logs"), spec)
+    run.begin(spec, {}, "train.py")
+    with pytest.raises(kind, match=said), run:
+        train(spec, run)
+    record = run.recorded()
+    assert record["state"] == "failed"
+    assert said.split()[-1] in record["reason"]
+    assert not (run.path / "Sick-v0.zip").exists()
+
+
+def test_an_agent_that_learns_nonsense_is_not_saved():
+    entry = {**SMALL_PPO, "learning_rate": 1e30, "max_grad_norm": 1e30}
+    with pytest.raises(UserError, match=r"is (nan|inf|-inf)"):
+        trained("ppo", CART, entry, n_timesteps=128, eval_freq=-1)
+    assert not list(Path("logs").rglob("CartPole-v1.zip"))
+
+
+@pytest.mark.parametrize(
+    ("algo", "entry", "said"),
+    [
+        ("ppo", {"n_episodes": 3, "learning_rate": "lin_0.1"}, "the schedules of ppo run by steps"),
+        ("ppo", {"policy": "CnnPolicy"}, "CnnPolicy"),
+        ("ppo", {"policy": "MlpPolcy"}, "unknown policy 'MlpPolcy': did you mean 'MlpPolicy'"),
+        ("ppo", {"policy_kwargs": {"net_arhc": [4]}}, "net_arhc"),
+        ("ppo", {"rollout_buffer_class": "HerReplayBuffer"}, "HerReplayBuffer"),
+        ("dqn", {"train_freq": [1, "day"]}, "day"),
+    ],
+)
+def test_what_only_the_constructor_knows_is_one_line_and_leaves_no_folder(algo, entry, said):
+    with pytest.raises(UserError) as caught:
+        trained(algo, CART, entry, n_timesteps=64)
+    assert said in str(caught.value)
+    assert not Path("logs").exists()
+
+
+def test_pictures():
+    spec = spec_of("qlearning", LAKE, n_timesteps=2000, diagnose=True)
+    run, outcome = run_of(spec.changed(pictures=True))
+    assert outcome.can_be_explained
+    for name in ("learning_curve.png", "value_map.png", "diagnosis.png"):
+        assert (run.path / name).stat().st_size > 5000
+
+
+def test_subprocesses_do_the_same():
+    common = {"n_timesteps": 64, "eval_freq": 32, "eval_episodes": 1, "final_episodes": 1}
+    common["n_eval_envs"], entry = 1, {**SMALL_PPO, "n_envs": 2}
+    here, _ = trained("ppo", CART, entry, **common)
+    there, _ = trained("ppo", CART, entry, vec_env="subproc", **common)
+    one, other = (np.load(run.path / "evaluations.npz")["results"] for run in (here, there))
+    np.testing.assert_array_equal(one, other)

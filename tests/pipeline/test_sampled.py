@@ -1,7 +1,6 @@
 """Sampled evaluation: it repeats, leaves training alone, takes its share, and has a yardstick."""
 
 import itertools
-from dataclasses import replace
 from functools import partial
 
 import gymnasium as gym
@@ -20,18 +19,16 @@ from rl_yardstick.pipeline.evaluation import sampled
 from rl_yardstick.pipeline.evaluation.sampled import (
     Evaluation,
     SampledEvaluator,
-    Shares,
     Yardstick,
-    allowed_steps,
     bracketed_yardstick,
     compiled_copy,
     evaluate,
     evaluate_compiled,
     evaluation_seed,
-    is_sure,
 )
 from rl_yardstick.pipeline.settings import HYPERPARAMS, TUNED_ON, read_yaml
 from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of, trained
+from tests.pipeline.test_resuming import content
 
 CAR = "MountainCar-v0"
 PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
@@ -44,9 +41,6 @@ def figures(evaluation):
 def episodes(*returns, length=10, yardstick=None, successes=None):
     lengths = np.full(len(returns), length)
     return Evaluation(np.array(returns, float), lengths, successes, yardstick=yardstick)
-
-
-# --- seeds ---------------------------------------------------------------------------------------
 
 
 def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile():
@@ -86,52 +80,11 @@ def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_strea
     assert not tuned & judged
 
 
-# --- what is played ------------------------------------------------------------------------------
-
-
-def test_deterministic_play_is_the_policys_best():
-    model = agent_of("qlearning", LAKE, exploration_initial_eps=1.0)
-    model.policy.q_tables.zero_()
-    model.policy.q_tables[..., 2] = 1.0
-    env = make_vec_env(LAKE, 1, env_kwargs={"is_slippery": False})
-    # Always to the right: along the upper edge until the time limit.
-    best, exploring = (evaluate(model, env, 5, 0, sure) for sure in (True, False))
-    assert best.lengths.tolist() == [100] * 5 != exploring.lengths.tolist()
-    assert best.successes is None
-
-
-def test_successes_are_counted_where_the_environment_tells_them():
-    env_kwargs = {"slip": 0.3, "shelf_reward": -1, "max_episode_steps": 40}
-    model = agent_of("qlearning", "Warehouse-v0", learning_rate=0.3).learn(60_000)
-    env = make_vec_env("Warehouse-v0", 4, env_kwargs=env_kwargs)
-    evaluation = evaluate(model, env, 200, seed=0)
-    # Each move costs 1, and the last one brings 100 if it succeeds.
-    failed = evaluation.returns == -evaluation.lengths
-    np.testing.assert_array_equal(evaluation.successes, ~failed)
-    np.testing.assert_array_equal(evaluation.returns[~failed], 101.0 - evaluation.lengths[~failed])
-    assert (evaluation.lengths[failed] == 40).all()
-    assert 0.05 < evaluation.success_rate == evaluation.successes.mean() < 0.95
-
-
 NORMALIZED = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 32, "batch_size": 32}
 NORMALIZED |= {"n_epochs": 2, "n_envs": 2, "normalize": True}
 
 
 def test_training_is_the_same_with_and_without_evaluations(tmp_path):
-    def learnt(run):
-        model = run.path / f"{CART}.zip"
-        weights = load_algorithm("ppo").load(model).policy.state_dict()
-        rows = [
-            [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()[2:]]
-            for path in sorted(run.path.glob("*.monitor.csv"))
-        ]
-        assert sum(map(len, rows)) > 5
-        statistics = VecNormalize.load(
-            str(run.path / CART / "vecnormalize.pkl"), make_vec_env(CART, 1)
-        )
-        kept = [*statistics.obs_rms.mean, statistics.ret_rms.var]
-        return rows, {key: value.tolist() for key, value in weights.items()}, kept
-
     common = {"n_timesteps": 400, "folder": tmp_path, "eval_episodes": 3}
     (often, found), (never, none) = (
         trained("ppo", CART, NORMALIZED, eval_freq=n, **common) for n in (40, -1)
@@ -139,25 +92,14 @@ def test_training_is_the_same_with_and_without_evaluations(tmp_path):
     assert len(np.load(often.path / "evaluations.npz")["timesteps"]) >= 10
     assert not (never.path / "evaluations.npz").exists()
     assert (found.final is None, none.final is None) == (False, True)
-    assert learnt(often) == learnt(never)
-
-
-# --- how much of it ------------------------------------------------------------------------------
-
-
-def test_when_a_mean_is_sure():
-    assert is_sure(episodes(*[7.0] * 10), 0.01)
-    assert not is_sure(episodes(*[7.0] * 5), 0.01), "five may be alike by chance"
-    # 9 and 11 in turn: mean 10, standard deviation sqrt(10/9), standard error 1/3.
-    assert is_sure(episodes(*[9.0, 11.0] * 5), 0.0334)
-    assert not is_sure(episodes(*[9.0, 11.0] * 5), 0.0333)
-    assert not is_sure(episodes(*[-1.0, 1.0] * 5), 0.5)
-
-
-def test_how_many_steps_are_allowed():
-    """A fifth of a short training, and from 10,000 on a hundredth; 2,000 in any case."""
-    allowed = [allowed_steps(n, Shares(1 / 100, 1 / 5)) for n in (1e3, 2e4, 4e5, 5e6)]
-    assert allowed == [2000, 4000, 10_000, 50_000]
+    for name in (f"{CART}.zip", "0.monitor.csv", "1.monitor.csv"):
+        assert content(often.path / name) == content(never.path / name), name
+    found, other = (
+        VecNormalize.load(str(each.path / CART / "vecnormalize.pkl"), make_vec_env(CART, 1))
+        for each in (often, never)
+    )
+    assert (found.obs_rms.mean == other.obs_rms.mean).all()
+    assert found.ret_rms.var == other.ret_rms.var
 
 
 class Steady(gym.Env):
@@ -220,29 +162,6 @@ def test_evaluations_are_left_out_while_they_are_too_dear(steady, tmp_path, monk
         assert evaluations["results"].shape == (2, 5)
 
 
-def test_what_is_asked_for_is_done_and_a_run_says_what_its_evaluations_took(tmp_path):
-    common, asked = {"folder": tmp_path, "n_timesteps": 500}, {"eval_freq": 100}
-    asked |= {"eval_episodes": 3, "final_episodes": 3}
-    run, _ = trained("random", CART, **asked, **common)
-    evaluations = np.load(run.path / "evaluations.npz")
-    assert evaluations["results"].shape == (5, 3)
-    assert "n_episodes" not in evaluations, "all have as many as there are columns"
-    assert run.recorded()["final"]["n_episodes"] == 3
-    entry = {"n_steps": 50, "batch_size": 50, "n_epochs": 1}
-    run, outcome = trained("ppo", CART, entry, **common)
-    info = run.recorded()
-    assert info["evaluation_steps"] == outcome.evaluation_steps > 0
-    evaluations = np.load(run.path / "evaluations.npz")
-    final, n_columns = info["final"], evaluations["results"].shape[1]
-    counts = np.array(evaluations.get("n_episodes", [n_columns] * len(evaluations["timesteps"])))
-    during = (evaluations["ep_lengths"].mean(axis=1) * counts).sum()
-    assert outcome.evaluation_steps == during + final["mean_length"] * final["n_episodes"]
-    assert info["best_episodes"] in counts
-    assert outcome.evaluation.taken.cpu_seconds > 0
-
-
-# --- measured by a bracket -----------------------------------------------------------------------
-
 POLE = Yardstick(optimum=500.0, baseline=20.0, at_least=480.0)
 
 
@@ -256,16 +175,11 @@ def test_the_upper_end_measures_and_the_lower_stands_beside_it():
     known = episodes(80.0, yardstick=Yardstick(100.0, 60.0)).summary()
     assert known["score"] == 0.5
     assert not {"optimum_at_least", "gap_at_least", "score_at_most"} & known.keys()
+    guessed = bracketed_yardstick(spec_of("random", "Acrobot-v1"))
+    assert guessed == Yardstick(-38.0, -498.625, -60.408, is_proven=False)
+    assert episodes(-40.0, yardstick=guessed).summary()["optimum_is_proven"] is False
 
 
-def test_an_upper_end_without_a_proof_is_marked_wherever_its_score_is_told():
-    guessed = episodes(*[260.0] * 10, yardstick=replace(POLE, is_proven=False))
-    assert guessed.summary()["optimum_is_proven"] is False
-    spec = spec_of("random", "Acrobot-v1")
-    assert bracketed_yardstick(spec) == Yardstick(-38.0, -498.625, -60.408, is_proven=False)
-
-
-# --- in compiled code: the episodes that evaluation in Python plays ------------------------------
 WIDTHS = {"low": [-2.4, -3.0, -0.21, -3.0], "high": [2.4, 3.0, 0.21, 3.0]}
 IN_BINS = partial(DiscretizeObservation, bins=[1, 6, 12, 6], **WIDTHS)
 SMALL = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [16]}}

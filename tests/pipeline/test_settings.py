@@ -1,7 +1,6 @@
 """Settings: every text that is read, every mistake in one line, entries, and ``auto``."""
 
 import json
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -45,8 +44,6 @@ def spec_of(algo="qlearning", env_id="FrozenLake-v1", **entry):
     return read_spec(algo, env_id, {"n_timesteps": 10, **entry})
 
 
-# --- texts ----------------------------------------------------------------------------------------
-
 LITERALS = [
     ("0.5", 0.5),
     ("1e-4", 1e-4),
@@ -55,9 +52,6 @@ LITERALS = [
     ("'text'", "text"),
     ("map.txt", "map.txt"),
     ("C:\\maps\\a.txt", "C:\\maps\\a.txt"),
-    ("None", None),
-    ("null", None),
-    ("False", False),
     ("false", False),
     ("[SFFF, FFFG]", ["SFFF", "FFFG"]),
     ("dict(net_arch=dict(pi=[64], vf=[64]))", {"net_arch": {"pi": [64], "vf": [64]}}),
@@ -95,8 +89,6 @@ def test_junk_is_read_or_refused_in_one_line(text):
             assert len(line) < 600
 
 
-# --- mistakes: an entry, and a part of the line -------------------------------------------------
-
 MISTAKES = [
     ("ppo", {"gama": 0.9}, "ppo has no hyperparameter 'gama': did you mean 'gamma'"),
     ("ppo", {"n_env": 2}, "did you mean 'n_envs'"),
@@ -104,12 +96,8 @@ MISTAKES = [
     ("ppo", {"noise_std": 0.1}, "no hyperparameter 'noise_std'"),
     ("td3", {"action_noise": 0.1}, "action_noise is set by noise_type and noise_std"),
     ("ppo", {"gamma": 1.5}, "gamma must be a number, not 1.5"),
-    ("ppo", {"gamma": "much"}, "gamma must be a number, not 'much'"),
     ("ppo", {"gamma": float("nan")}, "gamma must be"),
-    ("ppo", {"gamma": True}, "gamma must be a number, not True"),
-    ("ppo", {"learning_rate": -1}, "learning_rate must be"),
     ("ppo", {"learning_rate": "fast"}, "a number or a schedule such as lin_0.001, not 'fast'"),
-    ("ppo", {"batch_size": 0}, "batch_size must be a whole number, not 0"),
     ("ppo", {"batch_size": 1.5}, "batch_size must be a whole number, not 1.5"),
     ("ppo", {"policy_kwargs": [1]}, "policy_kwargs must be"),
     ("dqn", {"train_freq": "often"}, "train_freq must be a whole number, not 'often'"),
@@ -117,10 +105,6 @@ MISTAKES = [
     ("qlearning", {"tie_breaking": "frist"}, "not 'frist'"),
     ("qlearning", {"tie_breaking": 0}, "tie_breaking must be first or random, not 0"),
     ("ppo", {"n_timesteps": 0}, "n_timesteps: input should be greater than 0, not 0"),
-    ("ppo", {"n_timesteps": 1.5}, "n_timesteps: "),
-    ("ppo", {"n_timesteps": "x"}, "n_timesteps: "),
-    ("ppo", {"n_episodes": 1}, "give n_timesteps or n_episodes, not both"),
-    ("ppo", {"n_envs": 0}, "n_envs: "),
     ("ppo", {"normalize": {"norm_ob": True}}, "normalize: unknown argument 'norm_ob'"),
     ("ppo", {"normalize": {"norm_obs": "often"}}, "normalize: norm_obs must be true or false"),
     ("ppo", {"normalize": 1}, "normalize must be a mapping"),
@@ -136,7 +120,7 @@ MISTAKES = [
 @pytest.mark.parametrize(("algo", "entry", "said"), MISTAKES)
 def test_mistakes_are_one_line(algo, entry, said):
     with pytest.raises(UserError) as caught:
-        read_spec(algo, "FrozenLake-v1", {"n_timesteps": 10, **entry})
+        spec_of(algo, **entry)
     assert said in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
 
@@ -144,7 +128,6 @@ def test_mistakes_are_one_line(algo, entry, said):
 FILE_MISTAKES = [
     ("- a\n- b\n", "must map environment ids to hyperparameters"),
     ("A: 5\n", "the entry A must map names to values"),
-    ("A:\n  gamma: [0.9\n", "is no valid YAML"),
     ("A:\n  gamma: 1\n  gamma: 2\n", "the key 'gamma' is there twice"),
     ("A: {x: !!python/object/apply:os.system ['x']}\n", "is no valid YAML"),
     ("A: {}\n---\nB: {}\n", "is no valid YAML"),
@@ -164,26 +147,12 @@ def test_files_that_are_wrong(text, said, tmp_path):
         read_entry("ppo", "A", tmp_path / "config.py")
 
 
-def test_wrong_hyperparameters_are_refused_before_torch_is_imported():
-    import subprocess
-    import sys
-
-    code = "import sys\nfrom rl_yardstick.pipeline.settings import read_spec\n"
-    code += "try: read_spec('ppo', 'CartPole-v1', {'n_timesteps': 5, 'gama': 1})\n"
-    code += "except Exception as error: print(error, 'torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip().endswith("False")
-
-
 def test_the_table_of_arguments_is_up_to_date():
     table = json.loads(components.TABLE.read_text())
     installed = {name for name, entry in ALGORITHMS.items() if entry.is_installed}
     assert set(table) == installed | set(components.WRAPPERS)
     for owner in table:
         assert table[owner] == read_signature(owner), owner
-
-
-# --- entries --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", ZOO_FILES, ids=lambda path: path.stem)
@@ -267,9 +236,8 @@ def test_every_entry_builds_and_fits_its_agent_and_environment(algo):
         assert constructor_arguments(spec, load_algorithm(algo), False)
         assert TrainSpec.model_validate(json.loads(spec.model_dump_json())) == spec
         # The same settings, given as an entry, are the same training.
-        assert read_spec(algo, env_id, spec.hyperparams).changed(origins={}) == spec.changed(
-            origins={}
-        )
+        again = read_spec(algo, env_id, spec.hyperparams)
+        assert again.changed(origins={}) == spec.changed(origins={})
         check_fit(spec)
         training, evaluation = make_single_env(spec, training=True), make_single_env(spec)
         # What was learnt in the one must be of use in the other.
@@ -313,8 +281,6 @@ def test_what_is_asked_for_wins_over_an_entrys_variant_for_training():
         assert bool(told) == is_told
 
 
-# --- what ``auto`` stands for ---------------------------------------------------------------------
-
 CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": "auto"}}
 SCALE = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": "auto"}}
 SHORT = {"max_episode_steps": 200}
@@ -336,7 +302,7 @@ POOR = {"shelf_reward": -1, "step_reward": -0.01, "goal_reward": 1}
 )
 def test_the_word_becomes_a_number_of_the_environment(env_id, raw, value):
     algo = "qlearning" if "value_bound" not in raw else "r_max"
-    spec, key = read_spec(algo, env_id, {"n_timesteps": 10, **raw}), next(iter(raw))
+    spec, key = spec_of(algo, env_id, **raw), next(iter(raw))
     assert spec.hyperparams[key] == value
     assert spec.origins[key].startswith("auto")
     assert set(spec.origins) == {name for name in raw if str(raw[name]).startswith("auto")}
@@ -373,15 +339,4 @@ def test_what_cannot_be_worked_out_is_refused(env_id, raw, said, monkeypatch):
     monkeypatch.setattr(gym, "registry", gym.envs.registration.registry)
     gym.register("Unknown-v0", Unknown)
     with pytest.raises(UserError, match=said):
-        read_spec("qlearning", env_id, {"n_timesteps": 10, **raw})
-
-
-def test_paths_of_maps_do_not_reach_a_run(tmp_path, monkeypatch):
-    from rl_yardstick.pipeline.environments import map_name, with_files_read
-
-    (tmp_path / "hall.txt").write_text("S.\n.G\n")
-    entry = {"env_kwargs": {"desc": str(tmp_path / "hall.txt")}, "gamma": 0.9}
-    read = with_files_read("Warehouse-v0", entry)
-    assert read == {"env_kwargs": {"desc": ["S.", ".G"]}, "gamma": 0.9}
-    assert map_name("Warehouse-v0", entry) == Path("hall.txt").name
-    assert map_name("Warehouse-v0", read) == ""
+        spec_of("qlearning", env_id, **raw)

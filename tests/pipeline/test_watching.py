@@ -1,20 +1,15 @@
 """What a person watching reads and sees of a training: maps, curves and progress."""
 
 import io
-import json
 import re
-from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from rich.console import Console
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.pipeline import callbacks, watching
-from rl_yardstick.pipeline import pictures as drawing
 from rl_yardstick.pipeline.callbacks import ProgressCallback
 from rl_yardstick.pipeline.curve_pictures import read_monitors
 from rl_yardstick.pipeline.environments import make_training_env
@@ -23,6 +18,7 @@ from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.value_maps import value_map
 from rl_yardstick.pipeline.watching import TERMINATED, TableRecorder
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, run_of, spec_of, trained
+from tests.pipeline.test_resuming import content
 
 
 def watched_spec(algo="qlearning", settings=None, **fields):
@@ -31,9 +27,9 @@ def watched_spec(algo="qlearning", settings=None, **fields):
     return spec_of(algo, entry=settings, **{"watch_learning": "page.html", **fields})
 
 
-def watched(env, name="qlearning", n_timesteps=300, n_episodes=0, **settings):
+def watched(env, name="qlearning", n_timesteps=300, **settings):
     """An agent that was watched while it learnt, and what was kept."""
-    recorder = TableRecorder(n_episodes)
+    recorder = TableRecorder(0)
     agent = load_algorithm(name)(env=env, seed=1, **settings).learn(n_timesteps, recorder)
     return agent, recorder
 
@@ -61,7 +57,7 @@ def test_targets_are_those_of_the_rule_to_the_last_bit(engine):
 
 @pytest.mark.parametrize("name", ["double_qlearning", "dyna_q"])
 def test_tables_with_a_number_for_each_action_come_first(name):
-    _, recorder = watched(LAKE, name)
+    _, recorder = watched(LAKE, name, engine="interpreted")
     assert recorder.names[0] == "q_tables"
     assert recorder.has_actions
 
@@ -72,30 +68,16 @@ def episodes_of(folder):
 
 
 SMALL_PPO = {"n_steps": 32, "batch_size": 32}
-SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradient_steps": 2}
 
 
-@pytest.mark.parametrize(
-    ("algo", "settings"),
-    [
-        ("qlearning", {}),
-        ("ppo", SMALL_PPO),
-    ],
-)
+@pytest.mark.parametrize(("algo", "settings"), [("qlearning", {}), ("ppo", SMALL_PPO)])
 def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
     spec = watched_spec(algo, settings, n_timesteps=160)
     alone, plain = run_of(spec.changed(watch_learning=None), tmp_path)
     run, outcome = run_of(spec, tmp_path)
     assert outcome.engine == plain.engine
-    one, other = (
-        load_algorithm(algo).load(each.model_path(spec)).policy.state_dict()
-        for each in (alone, run)
-    )
-    assert all(one[name].numpy().tobytes() == other[name].numpy().tobytes() for name in one)
-    one, other = (episodes_of(each.path) for each in (alone, run))
-    assert one == other
-    one, other = (np.load(each.path / "evaluations.npz") for each in (alone, run))
-    assert one["results"].tobytes() == other["results"].tobytes()
+    for name in (f"{LAKE}.zip", "0.monitor.csv", "evaluations.npz"):
+        assert content(alone.path / name) == content(run.path / name), name
     assert len(outcome.watch.steps if algo == "qlearning" else outcome.watch.moments) > 4
 
 
@@ -121,9 +103,6 @@ def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, mo
     assert not (tmp_path / "logs").exists()
 
 
-# --- progress, in terminals and elsewhere ---------------------------------------------------------
-
-
 def text_shown(n_steps, *, live):
     """What is written while an agent learns."""
     file = io.StringIO()
@@ -145,32 +124,24 @@ def test_elsewhere_plain_lines_now_and_then_and_in_a_terminal_a_bar(monkeypatch)
 
 
 UP, DOWN, LEFT, RIGHT = range(4)
-MINUS = "\N{MINUS SIGN}"
 # The cells are 0 S, 1 free, 2 free; 3 free, 4 shelf, 5 goal.
 CORNER = {"desc": ["S..", ".#G"], "max_episode_steps": 10}
 
 
-def made(env_id, name="qlearning", env_kwargs=None):
-    """An evaluator, and an agent that has learnt nothing."""
-    spec = spec_of(name, env_id, {"env_kwargs": env_kwargs or {}})
-    return exact_evaluator(spec), agent_of(name, make_training_env(spec, None))
+def map_of(actions, **env_kwargs):
+    """The map of a table on a warehouse that prefers these actions, and action 0 elsewhere."""
+    spec = spec_of("qlearning", WAREHOUSE, {"env_kwargs": env_kwargs})
+    agent = agent_of("qlearning", make_training_env(spec, None))
+    agent.policy.q_tables[0, range(len(actions)), actions] = 1.0
+    return value_map(exact_evaluator(spec), agent)
 
-
-def map_of(env_id, actions=(), **env_kwargs):
-    """The map of a table that prefers these actions, and action 0 elsewhere."""
-    evaluator, agent = made(env_id, env_kwargs=env_kwargs)
-    agent.policy.q_tables[0, range(len(actions)), list(actions)] = 1.0
-    return value_map(evaluator, agent)
-
-
-# --- one map -------------------------------------------------------------------------------------
 
 # Right, left again; down onto the goal; up against the outer wall from below the start.
 THERE_AND_BACK = [RIGHT, LEFT, DOWN, LEFT, UP, UP]
 
 
 def test_a_map_worked_by_hand():
-    found = map_of(WAREHOUSE, THERE_AND_BACK, **CORNER)
+    found = map_of(THERE_AND_BACK, **CORNER)
     assert found.layout.rows == ("S..", ".#G")
     assert found.matters.tolist() == [True, True, True, True, False, False]
     assert found.initial.tolist() == [1, 0, 0, 0, 0, 0]
@@ -187,13 +158,10 @@ def test_an_action_among_several_best_ones_does_not_differ():
     square = {"desc": ["..G", "...", "S.."], "max_episode_steps": 20}
     for first in (UP, RIGHT):
         actions = [RIGHT, RIGHT, 0, RIGHT, RIGHT, UP, first, RIGHT, UP]
-        found = map_of(WAREHOUSE, actions, **square)
+        found = map_of(actions, **square)
         assert not found.differs.any()
         assert found.values[6] == found.optimal_values[6] == 97
     assert found.optimal_actions[6].tolist() == [True, False, False, True]
-
-
-# --- over the training ---------------------------------------------------------------------------
 
 
 def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(tmp_path):
@@ -219,91 +187,12 @@ def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(tmp_path):
     assert (run.path / "value_map.png").read_bytes().startswith(b"\x89PNG")
 
 
-# --- the picture of a map ------------------------------------------------------------------------
-
-
-def test_numbers_on_a_map_are_returns_with_three_digits_or_more():
-    for value, told in ((0.74019, "0.7402"), (79.0, "79"), (-1234.5, "\N{MINUS SIGN}1,234")):
-        assert drawing.return_number(value) == told
-    for best, decimals in (([0.47, 0.924], 3), ([1.5, 9.25], 2), ([-30.5, 79.0], 1), ([79, 80], 0)):
-        one = np.array(best)
-        found = SimpleNamespace(values=one, optimal_values=one, matters=np.ones(2, dtype=bool))
-        assert drawing.decimals_for(found) == decimals
-
-
-def test_frames_and_arrows_are_what_the_map_says():
-    """Frames where agent and optimum part; arrows where each of them goes."""
-    policies = drawing.policies_in(map_of(WAREHOUSE, THERE_AND_BACK, **CORNER), 0)
-    for policy in policies:
-        axes = Figure().subplots()
-        drawing.mark_differing(axes, policy, cell=36)
-        centres = [segment[:4].mean(axis=0) for segment in axes.collections[-1].get_segments()]
-        np.testing.assert_allclose(centres, [(1, 0), (0, 1)])  # columns across, rows down
-    axes = Figure().subplots()
-    drawing.draw_arrows(axes, policies[0], 0.08, with_numbers=False)
-    # Middle and direction of every arrow, with how strong it is: dark where the agent comes to.
-    arrows = [
-        (round(x + u / 2, 6), round(y + v / 2, 6), np.sign(u), np.sign(v), quiver.get_alpha())
-        for quiver in axes.collections
-        for (x, y), u, v in zip(quiver.XY, quiver.U, quiver.V, strict=True)
-    ]
-    right, left = [(0, 0, 1, 0, 1.0), (0, 1, -1, 0, 0.45)], [(1, 0, -1, 0, 1.0), (2, 0, 0, 1, 0.45)]
-    assert sorted(arrows) == right + left
-
-
-# --- the learning curve --------------------------------------------------------------------------
-
-
-def write_monitor(folder, name, rows, start=1000.0):
-    header = json.dumps({"t_start": start, "env_id": "FrozenLake-v1"})
-    lines = [f"#{header}", "r,l,t", *(",".join(map(str, row)) for row in rows)]
-    (folder / f"{name}.monitor.csv").write_text("\n".join(lines) + "\n")
-
-
 def test_the_episodes_of_several_environments_in_the_order_in_which_they_ended(tmp_path):
     assert [array.shape for array in read_monitors(tmp_path)] == [(0,), (0,)]
     # Three environments step together: the second one's first episode ends after 3 x 4 steps.
-    write_monitor(tmp_path, 0, [(1, 10, 9.0), (2, 5, 9.5)])
     # Clocks do not count: processes start when they can.
-    write_monitor(tmp_path, 1, [(3, 4, 0.1), (4, 8, 0.2)], start=2000.0)
-    write_monitor(tmp_path, 2, [(5, 11, 50.0)], start=500.0)
+    for name, rows in enumerate(("1,10,9.0\n2,5,9.5\n", "3,4,0.1\n4,8,0.2\n", "5,11,50.0\n")):
+        (tmp_path / f"{name}.monitor.csv").write_text("#{}\nr,l,t\n" + rows)
     steps, returns = read_monitors(tmp_path)
     assert steps.tolist() == [12, 30, 33, 36, 45]
     assert returns.tolist() == [3, 1, 5, 4, 2]
-
-
-class Corridor(gym.Env):
-    """Two steps forward, with rewards of 1 and 2; the third cell is the end."""
-
-    observation_space, action_space = gym.spaces.Discrete(3), gym.spaces.Discrete(1)
-
-    def reset(self, **options):
-        super().reset(**options)
-        self.cell = 0
-        return 0, {}
-
-    def step(self, action):
-        self.cell += 1
-        return self.cell, float(self.cell), self.cell == 2, False, {}
-
-
-def test_two_episodes_worked_by_hand():
-    """With step size and discount 1/2: targets 1, 2, then 1 + 1/2 = 1.5, 2."""
-    halves = {"learning_rate": 0.5, "gamma": 0.5}
-    _, recorder = watched(Corridor(), n_timesteps=9, n_episodes=2, **halves)
-    moves, changes = recorder.rows()["moves"], recorder.rows()["changes"]
-    assert moves["target"].tolist() == [1.0, 2.0, 1.5, 2.0]
-    assert moves["td_error"].tolist() == [1.0, 2.0, 1.0, 1.0]
-    assert moves["obs"].tolist() == [0, 1, 0, 1]
-    assert moves["next_obs"].tolist() == [1, 2, 1, 2]
-    assert moves["reward"].tolist() == [1.0, 2.0, 1.0, 2.0]
-    assert moves["episode_return"].tolist() == [1.0, 3.0, 1.0, 3.0]
-    assert moves["episode"].tolist() == [0, 0, 1, 1]
-    assert moves["end"].tolist() == [0, TERMINATED, 0, TERMINATED]
-    assert changes["entry"].tolist() == [0, 1, 0, 1]
-    assert changes["after"].tolist() == [0.5, 1.0, 1.0, 1.5]
-    assert changes["step"].tolist() == [0, 1, 2, 3]
-    assert recorder.rows()["steps"]["timesteps"].tolist() == [1, 2, 3, 4]
-    assert recorder.rows()["steps"]["learning_rate"].tolist() == [0.5] * 4
-    # The two episodes are over: nothing was left out.
-    assert (recorder.is_full, recorder.is_cut) == (True, False)

@@ -44,18 +44,10 @@ def tuning_trial():
     def trial(number, value, figures, state="complete", failure=None, **params):
         at = f"2026-01-01T00:{{:02d}}:{number % 60:02d}"
         more = {"tau": 1.0} if number == 2 else {}
-        return {
-            "number": number,
-            "state": state,
-            "value": value,
-            "failure": failure,
-            "params": {"rate": 0.1, "kind": "a", "steps": 3} | params,
-            "settings": {"learning_rate": number, "gamma": 0.9, **more},
-            "figures": figures,
-            "seconds": 2.0 * len(figures),
-            "began": at.format(0),
-            "ended": at.format(1),
-        }
+        told = {"number": number, "state": state, "value": value, "failure": failure}
+        told |= {"params": {"rate": 0.1, "kind": "a", "steps": 3} | params, "figures": figures}
+        told |= {"settings": {"learning_rate": number, "gamma": 0.9, **more}}
+        return told | {"seconds": 2.0 * len(figures), "began": at.format(0), "ended": at.format(1)}
 
     return trial
 
@@ -74,17 +66,10 @@ def tuning_record(tuning_trial):
     winner |= {"verdict": "better so far"}
     asked = {"algo": "dqn", "env": "Toy-v0", "sampler": "tpe", "pruner": "auto"}
     retest = {"settings": [shipped, winner], "winner": "trial 2", "winner_file": "winner.yml"}
-    return {
-        "name": "t",
-        "command": "python tune.py <script>",
-        "widened": ["rate"],
-        "figure": "score",
-        "objective": "mean",
-        "lower_is_better": False,
-        "n_trials": 10,
-        "n_at_optimum": 0,
-        "seeds": [1, 0],
-        "held_out_seeds": [1000, 1001],
+    record = {"name": "t", "command": "python tune.py <script>", "widened": ["rate"]}
+    record |= {"figure": "score", "objective": "mean", "lower_is_better": False, "n_trials": 10}
+    record |= {"n_at_optimum": 0, "seeds": [1, 0], "held_out_seeds": [1000, 1001]}
+    return record | {
         "asked": {**asked, "search_space": space},
         "trials": [
             tuning_trial(0, 0.6, {"1": 0.6, "0": 0.6}),

@@ -1,6 +1,5 @@
 """What figures show, asked of Matplotlib's axes: numbers, colours, words; and nothing is cut."""
 
-from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -10,16 +9,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection, QuadMesh
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FixedLocator, PercentFormatter
 
 from rl_yardstick.experiments.analysis import OverallAnalysis
-from rl_yardstick.report.figures import (
-    draw_learning_curves,
-    draw_runs,
-    label_ends,
-    write_figures,
-)
+from rl_yardstick.report.figures import write_figures
 from rl_yardstick.report.series import (
     COLOURS,
     AgentRuns,
@@ -29,7 +22,6 @@ from rl_yardstick.report.series import (
     EnvironmentSeries,
     Grid,
     LearningCurves,
-    Mark,
     PullSeries,
     RegretBounds,
     StudySeries,
@@ -329,79 +321,3 @@ def test_nothing_is_cut_by_matplotlibs_own_extents(drawn, tmp_path):
         for axes in shown:
             assert axes.bbox.width > 1.2 * inch, path.name
             assert axes.bbox.height > 0.8 * inch, path.name
-
-
-MARKS = {"first": Mark("first", 1, "dash"), "second": Mark("second", 0, "solid")}
-
-
-def drawn_curves(place, *curves, **evaluation):
-    """Panels of both kinds; the budget of evaluations may be changed."""
-    axes, found = Figure().subplots(1, 2), curves_of(["first", "second"], *curves)
-    found["evaluation"] = replace(found["evaluation"], **evaluation)
-    draw_learning_curves(axes, EnvironmentSeries(place, found, (), None, {}), MARKS)
-    return axes
-
-
-def test_what_stands_beside_curves():
-    place = made_up.environment(optimum_at_least=90.0, optimum_is_proven=False)
-    left, _ = drawn_curves(place, 79.0, ("first", "second"))
-    *lines, legend = described(left.figure)
-    assert legend == (
-        "names first, second, optimum, at most (not proven), optimum, at least, best random or "
-        "constant policy, trained on a variant of the environment, 95 % interval"
-    )
-    assert lines[0] == "lake: evaluations | environment steps | return (log scale beyond ±79)"
-    title = "training episodes (2 agents: on a variant of the environment)"
-    assert f"{title} | episodes | return" in lines
-    ticks = [tick for tick in left.get_yticks() if abs(tick) < 2000]
-    assert ticks == [-1000, -300, -100, -50, 0, 50, 100, 300, 1000]
-
-
-@pytest.mark.parametrize(
-    ("scale", "on_variant", "is_shared"),
-    [(None, (), True), (79.0, (), True), (79.0, ("first",), False)],
-)
-def test_panels_of_one_metric_have_one_y_axis_and_evaluations_the_axis_of_the_budget(
-    scale, on_variant, is_shared
-):
-    left, right = drawn_curves(made_up.environment(), scale, on_variant, budget="episode")
-    assert (left.get_ylim() == right.get_ylim()) == is_shared
-    assert (left.get_yscale() == right.get_yscale()) == is_shared
-    assert left.get_xlabel() == "episodes"
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "n", "expected", "said"),
-    [
-        (80, 95, 5, "orange - (80 0) (95 0)", "mean, 95 % interval, each seed"),
-        (90, 90, 5, "orange D (90 0) (90 0)", "each seed; diamond: all runs are equal"),
-        (88, 92, 2, "orange - (88 0) (92 0)", "mean, range, each seed"),
-    ],
-)
-def test_an_interval_of_one_point_has_a_mark_and_few_runs_have_their_range(
-    low, high, n, expected, said
-):
-    axes, mean = Figure().subplots(), made_up.estimate(90.0, low, high, n)
-    runs = [AgentRuns("first", mean, np.arange(2), np.array([88, 92]))]
-    draw_runs(axes, EnvironmentSeries(made_up.environment(), None, runs, None, {}), "final", MARKS)
-    dots, interval, tick, _ = map(line_words, axes.get_lines())
-    assert (dots, tick) == ("orange . (88 -0.18) (92 0.18)", "orange | (90 0)")
-    assert interval == expected
-    assert axes.get_xlabel().replace("\n", " ").endswith(said)
-
-
-def test_names_at_the_ends_of_lines_never_overlap_and_make_the_figure_as_tall_as_they_need():
-    figure = Figure(figsize=(6, 3))
-    axes = figure.subplots()
-    axes.set_ylim(0, 1)
-    label_ends(axes, [(f"agent {n}", 1.0, 0.5, "black") for n in range(40)])
-    places = sorted(text.xyann[1] for text in axes.texts)  # shares of the height of the axes
-    assert len(places) == 40
-    inches = axes.get_position().height * figure.get_figheight()
-    assert min(np.diff(places)) * inches > 0.11  # eight points of print
-    assert 0 <= places[0] < places[-1] <= 1
-
-
-def test_no_two_of_many_agents_have_one_mark():
-    marks = agent_marks(made_up.study([f"agent {n}" for n in range(28)])).values()
-    assert len({(mark.colour, mark.dash) for mark in marks}) == 28

@@ -4,7 +4,6 @@ import base64
 import gzip
 import json
 import re
-from concurrent.futures import Future
 from dataclasses import replace
 
 import numpy as np
@@ -52,19 +51,6 @@ def test_the_data_are_what_was_recorded_to_the_last_digit(watched, page_of):
     assert (data["n_states"], len(data["actions"]), data["is_cut"]) == (6, 4, False)
 
 
-def test_without_a_table_the_policy_in_every_state(watched, page_of):
-    spec, watch = watched("FrozenLake-v1", "value_iteration", {"n_timesteps": 128})
-    data, text = page_of(spec, watch)
-    assert (data["kind"], data["stride"]) == ("maps", 1)
-    assert "from evaluation to evaluation" in text
-    moments, (_, timesteps, values, actions) = data["moments"], watch.moments[-1]
-    assert (moments["timesteps"][-1], moments["actions"][-1]) == (timesteps, actions.tolist())
-    assert moments["return"][-1] == values[0] > 0.5
-    # Where an episode has ended nothing is done.
-    reachable = watch.evaluator.model.reachable.tolist()
-    assert [value is not None for value in moments["values"][0]] == reachable
-
-
 def test_a_page_is_no_larger_than_three_megabytes(watched, page_of, monkeypatch):
     training = watched("Warehouse-v0", "qlearning", {"n_timesteps": 800})
     _, text = page_of(*training)
@@ -82,23 +68,7 @@ def test_a_page_is_no_larger_than_three_megabytes(watched, page_of, monkeypatch)
     assert max(cut["changes"]["step"]) < n_steps
 
 
-class Here:
-    """A pool of this process: another one would import all libraries."""
-
-    def __init__(self, n_workers):
-        self.stop = self.join = lambda: None
-
-    def submit(self, function, timeout, *args):
-        future = Future()
-        try:
-            future.set_result(function(*args))
-        except Exception as error:  # noqa: BLE001  # as a pool does
-            future.set_exception(error)
-        return future
-
-
-def test_each_agent_that_learns_is_shown_once_and_kept(do_study, tmp_path, monkeypatch):
-    monkeypatch.setattr(learning, "process_pool", Here)
+def test_each_agent_that_learns_is_shown_once_and_kept(do_study, tmp_path, in_this_process):
     agents = (AgentSpec("Q-learning & co", "qlearning"), AgentSpec(HOSTILE, "random"))
     places = (EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1", {"n_timesteps": 300}),)
     analysis = analyse(do_study(StudySpec("small", "", agents, places, n_seeds=1), tmp_path))

@@ -203,8 +203,6 @@ def test_the_page_of_a_search_draws_and_fits_a_telephone(browser, tuning_record,
     browser.asks_nobody(path)
 
 
-# --- pages that play a training -------------------------------------------------------------------
-
 ASKED = {
     "rows": ("Hostile-v0", "qlearning", {"n_timesteps": 300}),
     "updates": ("FrozenLake-v1", "ppo", {"n_timesteps": 128, "n_steps": 64}),

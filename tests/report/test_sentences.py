@@ -1,5 +1,7 @@
-"""What a study says in words: each sentence worked by hand, and all of them true of the runs."""
+"""What a study says in words: worked by hand, true of the runs, one word wherever it is shown."""
 
+import io
+import json
 import math
 import re
 from dataclasses import replace
@@ -10,15 +12,21 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.report.documents import headline, verdicts_as
-from rl_yardstick.report.words import conclusion, pairs_both_ways, unseen_sentence
-from rl_yardstick.verdicts import Best, ThresholdSummary
+from rl_yardstick.report.documents import headline, verdicts_as, write_verdicts
+from rl_yardstick.report.page import render, result_sections
+from rl_yardstick.report.page.frame import Report
+from rl_yardstick.report.series import EnvironmentSeries, StudySeries, agent_marks, run_series
+from rl_yardstick.report.terminal import print_analysis
+from rl_yardstick.report.words import conclusion, pairs_both_ways
+from rl_yardstick.verdicts import Best, judge
 from tests.report import made_up
+from tests.report.test_page import Page
 
 NAN, INF = math.nan, math.inf
 
@@ -87,21 +95,6 @@ def test_pairs_with_one_word_stand_in_one_sentence_of_the_better_agent(words, ch
     assert said(place_of(words, **changes)).pairs == tuple(sentences)
 
 
-def test_how_soon_agents_arrive():
-    stays = {"slow": (0.75, 3000.0), "quick": (1.0, 1000.0), "late": (0.25, INF), "never": (0, INF)}
-    agents = []
-    for name, (share, steps) in stays.items():
-        found = ThresholdSummary(made_up.estimate(steps, n=4), made_up.estimate(share, n=4))
-        agents.append(made_up.agent(name, 90.0 - len(agents), steps_to_stay=found))
-    assert said(made_up.environment(agents)).notes == (
-        (
-            "quick stays above a score of 0.95 in 4 of 4 runs, in the median run from step 1,000; "
-            "slow in 3 of 4 runs, in the median run from step 3,000; late in 1 of 4 runs; never in "
-            "none."
-        ),
-    )
-
-
 @pytest.mark.parametrize(
     ("changes", "notes"),
     [
@@ -122,17 +115,6 @@ def test_what_else_is_said(changes, notes):
     for agents, first in ((place.agents, []), ((failing,), ["3 of 20 runs of a failed."])):
         told = said(replace(place, agents=(*agents, *place.agents[1:])[:2])).notes
         assert list(told) == [*first, *notes]
-
-
-def test_once_a_page_it_is_said_what_so_few_runs_cannot_show():
-    few = made_up.analysis([place_of({}, TWO)], ["a", "b"])
-    assert unseen_sentence(few) == (
-        "A failure that no run showed is not counted: with 4 runs up to 53 % of further runs "
-        "could fail."
-    )
-
-
-# === what is said is true of the runs =============================================================
 
 
 def study_of(runs, root=None):
@@ -182,3 +164,103 @@ def test_what_is_said_is_true_of_the_runs(runs):
     assert set(re.findall(r"\| `([A-D])` \| \*\*", table)) == bold
     in_tex = verdicts_as("tex", analysis, "").partition(r"\subsection")[0]
     assert set(re.findall(r"\\texttt\{([A-D])\} & \\textbf", in_tex)) == bold
+
+
+SCORES = {
+    "best": [1.0] * 12,
+    "same": [1.0] * 12,
+    "noisy": [1.0, 0.4, 1.0, 0.7] * 3,
+    "bad": [0.2, 0.3, 0.25, 0.2] * 3,
+}
+
+
+@pytest.fixture(scope="module", params=[12, 4], ids=["many", "few"])
+def study(request, tmp_path_factory):
+    """The analysis, its words by pair, and all files."""
+    runs = {name: values[: request.param] for name, values in SCORES.items()}
+    analysis = study_of(runs, tmp_path_factory.mktemp("study"))
+    said = judge({"world": runs}, bounds=(0, 1))
+    words = {(p.first, p.second): p.text for pair in said.pairs for p in (pair, pair.swapped())}
+    write_verdicts(analysis, "compare")
+    return analysis, words, str(said.best["world"])
+
+
+def both_ways(rows):
+    """Words by pair, from rows of first agent, word, second agent."""
+    turned = {"better": "worse", "worse": "better"}
+    found = {}
+    for first, word, second in rows:
+        kind, *rest = word.split(" ", 1)
+        found[first, second] = word
+        found[second, first] = " ".join([turned.get(kind, kind), *rest])
+    return found
+
+
+def of_sentences(text):
+    """The words in sentences such as "a is better so far than b (...) and c (...)."."""
+    rows = []
+    ways = r"(better|tied|undecided)( so far)? (?:than|with|against) (.*?\))\."
+    for first, word, few, others in re.findall(rf"(\w+) is {ways}", " ".join(text.split())):
+        rows += [(first, word + few, second) for second in re.findall(r"(\w+) \(", others)]
+    return both_ways(rows)
+
+
+def test_python_csv_json_markdown_and_latex_agree(study):
+    analysis, words, best = study
+    root = analysis.results.root
+    table = pd.read_csv(root / "verdicts.csv")
+    rows = table[["first", "verdict", "second"]].itertuples(index=False)
+    assert both_ways(rows) == words
+    data = json.loads((root / "verdicts.json").read_text())
+    assert both_ways((p["first"], p["verdict"], p["second"]) for p in data["pairs"]) == words
+    assert data["best"]["world"]["text"] == best
+    assert str(analysis.environments[0].best) == best
+    for pair, (_, row) in zip(data["pairs"], table.iterrows(), strict=True):
+        assert [pair["low"], pair["high"]] == pytest.approx([row["low"], row["high"]])
+    for suffix in ("md", "tex"):
+        text = (root / f"verdicts.{suffix}").read_text()
+        assert of_sentences(text.partition("Best: ")[2]) == words
+        assert f"Best: {best};" in text
+
+
+@pytest.mark.parametrize("width", [30, 200])
+def test_the_terminal_agrees(study, width):
+    analysis, words, best = study
+    out = io.StringIO()
+    print_analysis(Console(file=out, width=width), analysis)
+    text = out.getvalue()
+    assert f"Best: {best};" in " ".join(text.split())
+    if width == 30:  # too narrow for a table of words
+        assert of_sentences(text) == words
+        return
+    head = next(line for line in text.splitlines() if " vs " in line)
+    names = re.findall(r"vs (\w+)", head)
+    lines = text.splitlines()[text.splitlines().index(head) + 1 :][: len(names)]
+    rows = []  # a triangle: a row and columns of agents
+    for line in lines:
+        first, *cells = re.split(r"\s{2,}", line.strip())
+        rows += [(first, *both) for both in zip(cells, names[-len(cells) :], strict=True)]
+    assert both_ways(rows) == words
+
+
+def test_the_page_and_the_data_of_its_figures_agree(study):
+    analysis, words, best = study
+    (place,) = analysis.environments
+    one = EnvironmentSeries(place, None, run_series(analysis.results, place), None, {})
+    report = Report(StudySeries(analysis, agent_marks(analysis.study), (one,)), "compare")
+    sections = [result_sections.verdict(report), result_sections.comparison(report)]
+    page = Page(render(report, sections))
+    text = page.sections["verdict"]
+    assert f"Best: {best};" in text
+    assert of_sentences(text.partition("All pairs in words")[2]) == words
+    cells = [
+        (*attributes["title"].split(" against "), word.strip())
+        for attributes, word in page.all("td")
+        if attributes.get("class", "").startswith("verdict ")
+    ]
+    assert both_ways((first, word, second) for first, second, word in cells) == words
+    chips = [word.strip() for a, word in page.all("span") if "chip" in a.get("class", "")]
+    assert chips == [words[pair.first, pair.second] for pair in place.pairs]
+    data = page.data("data-comparison-0")
+    drawn = [(key.split(" | "), word) for key, word in data["words"].items()]
+    assert both_ways((first, word, second) for (first, second), word in drawn) == words

@@ -2,9 +2,7 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,17 +11,13 @@ from scipy import integrate
 import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.bandits import pull_statistics
-from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.report.series import (
     auer_bound,
-    best_expected_reward,
     best_of_normals,
     grids,
     lai_robbins_slope,
     learning_curves,
-    linear_up_to,
     mean_regret,
     regret_of_runs,
     run_series,
@@ -81,40 +75,11 @@ def test_mean_curves_the_best_agent_first(lake):
     assert (found["evaluation"].on_variant, found["training"].on_variant) == ((), ("b",))
 
 
-def test_a_curve_of_single_points_is_left_out_and_episodes_are_the_axis_of_their_budget(lake):
-    results, place = lake
-    first = results.curves[results.curves["step"] == 10]
-    found = learning_curves(replace(results, curves=first), place)
-    assert not any(of_agents for each in found.values() for of_agents in each.by_axis.values())
-    for budget, expected in (({"n_episodes": 9}, "episode"), ({"n_timesteps": 9}, "step")):
-        spec = TrainSpec(algo="qlearning", env_id="FrozenLake-v1", **budget)
-        runs = tuple(PlannedRun("b", name, 0, spec, Path()) for name in ("lake", "other"))
-        curves = learning_curves(replace(results, planned=runs), place)
-        assert curves["evaluation"].budget == expected
-
-
 def test_runs_with_a_figure_by_seed(lake):
     found = [
         (r.agent, r.seeds.tolist(), r.values.tolist(), r.mean.point) for r in run_series(*lake)
     ]
     assert found == [("b", [0], [8], 90), ("a", [0, 2], [4, 6], 40)]
-
-
-@pytest.mark.parametrize(
-    ("curves", "optimum", "expected"),
-    [
-        ([[-7900.0, -50.0, 70.0]], 79.0, 79.0),  # two decades beyond the optimum
-        ([[-7899.0, -50.0, 70.0]], 79.0, None),
-        ([[-300.0, 1.0, 2.0, 2.0]], None, 2.0),  # the end of the curve stands for the optimum
-        ([[np.nan, 1.0], [np.nan]], None, None),
-        ([[-99.0, 0.0]], 0.1, None),  # returns below one are never dwarfed by those below 100
-    ],
-)
-def test_where_an_axis_ceases_to_be_linear(curves, optimum, expected):
-    assert linear_up_to([np.array(curve) for curve in curves], optimum) == expected
-
-
-# --- sweeps ---------------------------------------------------------------------------------------
 
 
 def swept(label, value, group="sarsa", name="alpha"):
@@ -132,13 +97,6 @@ def test_a_sweep_goes_in_the_order_of_its_values():
     assert curve.y.tolist() == [1, 5, 9]
     assert curve.low == pytest.approx([0.9, 4.9, 8.9])
     assert curve.high == pytest.approx([1.2, 5.2, 9.2])
-
-
-def test_what_makes_no_sweep():
-    """Two values make no line, and a third that is no number or without a run makes none of it."""
-    place = made_up.environment([made_up.agent(label, 1.0) for label in "abc"])
-    for third in ([], [swept("c", 3, name="gamma")], [swept("c", "lin_0.5")], [swept("d", 3)]):
-        assert sweeps([swept("a", 1), swept("b", 2), *third], place) == {}
 
 
 def test_two_parameters_make_a_grid():
@@ -161,8 +119,6 @@ def test_two_parameters_make_a_grid():
     assert with_best_mean(environment, [spec.label for spec in specs]) == ["0.1 b", "0.5 a"]
     assert grids(specs[:2], environment) == {}  # a single row is none
 
-
-# --- bandits --------------------------------------------------------------------------------------
 
 # Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
 ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
@@ -203,22 +159,6 @@ def test_best_of_normals():
     by_hand = [0, 1 / math.sqrt(math.pi), 1.5 / math.sqrt(math.pi)]
     assert [best_of_normals(n) for n in (1, 2, 3)] == pytest.approx(by_hand, abs=1e-9)
     assert best_of_normals(10) == pytest.approx(1.5388, abs=5e-5)
-
-
-@pytest.mark.parametrize(
-    ("env_id", "kwargs", "expected"),
-    [
-        ("SegmentBandit-v0", {}, 0.3 * 0.25 + 0.7 * 0.12),
-        ("GaussianBandit-v0", {"mean_loc": 4.0, "n_arms": 2}, 4 + 1 / math.sqrt(math.pi)),
-        ("GaussianBandit-v0", {"means": [0.0, 0.0], "drift_std": 0.1}, None),
-    ],
-)
-def test_best_expected_reward(env_id, kwargs, expected):
-    env = gym.make(env_id, **kwargs)
-    env.reset(seed=0)
-    best = best_expected_reward(env)
-    env.close()
-    assert best == (None if expected is None else pytest.approx(expected))
 
 
 @pytest.fixture(scope="module")

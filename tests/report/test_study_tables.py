@@ -1,20 +1,20 @@
-"""A study as tables: in Markdown and in LaTeX; and the ranking on the page.
+"""A study as tables: in Markdown, in LaTeX, on the page, and in terminals of any width."""
 
-What the terminal prints is recorded in ``tests/golden``.
-"""
-
+import io
 import math
 import re
 from dataclasses import replace
 
 import pytest
 
+from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.report import documents
 from rl_yardstick.report.documents import MARKUPS, headline, ranking, table_as
 from rl_yardstick.report.page import result_sections
 from rl_yardstick.report.page.frame import Report
 from rl_yardstick.report.ranking import COLUMNS, Row
 from rl_yardstick.report.series import StudySeries
+from rl_yardstick.report.terminal import print_analysis
 from rl_yardstick.report.words import conclusion
 from rl_yardstick.verdicts import Best, Estimate, ThresholdSummary
 from tests.report import made_up
@@ -36,8 +36,6 @@ def lake(**changes):
 def of_lake(cpu=(), **changes):
     return made_up.analysis([lake(**changes)], NAMES, cpu=cpu)
 
-
-# --- Markdown and LaTeX ---------------------------------------------------------------------------
 
 LEGEND = (
     "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts as 0. "
@@ -61,12 +59,6 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
         ("first", "lake"): 40.4,
         ("same", "lake"): 0.1249,
     }
-
-
-def test_nobody_leads_where_none_has_learnt():
-    for changes, n_bold in (({}, 3), ({"baseline": 95.0}, 0)):
-        rows = headline(of_lake(**changes)).rows
-        assert sum(cell.is_bold for row in rows for cell in row.cells) == n_bold
 
 
 def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_footnote():
@@ -125,14 +117,10 @@ def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
     assert "%" not in re.sub(r"\\%|\{%$", "", "\n".join(lines), flags=re.MULTILINE)
 
 
-# === the ranking on the page ======================================================================
-
-
 def tables_of(agents, **changes):
     """What the page shows of agents on an environment."""
-    found = made_up.analysis(
-        [made_up.environment(agents, **changes)], [agent.agent for agent in agents]
-    )
+    place = made_up.environment(agents, **changes)
+    found = made_up.analysis([place], [agent.agent for agent in agents])
     (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
     return table
 
@@ -190,26 +178,45 @@ def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
     (_, slow), (_, absent) = table["rows"]
     stays = slow[titles.index("Stays from")]
     assert (stays.text, stays.value, stays.note) == ("never", math.inf, "25% of runs")
-    for title in ("Mean", "Score", "Gap", "Success", "Stays from", "CPU time"):
+    for title in ("Mean", "Score", "Gap", "Stays from", "CPU time"):
         cell = absent[titles.index(title)]
         assert (cell.text, cell.value, cell.note, cell.aside) == ("-", None, "", ""), title
 
 
-def test_returns_beside_that_of_the_greedy_policy_stand_below_the_ranking():
-    explores = {"stochastic": made_up.estimate(70.0), "acts_by": "epsilon 0.1"}
-    discounts = {"discount": 0.9, "discounted": made_up.estimate(30.0), "discounted_optimum": 34.5}
-    agents = [
-        made_up.agent("both", 90.0, **explores, **discounts),
-        made_up.agent("plans", 80.0, discount=0.5),
-        made_up.agent("plain", 40.0),
-    ]
-    table = tables_of(agents)["others"]
-    assert [column.page for column in table["columns"]] == ["Greedy", "Stochastic", "Discounted"]
-    shown = [[f"{cell.text} {cell.note}".strip() for cell in cells] for _, cells in table["rows"]]
-    assert shown == [
-        ["93 92.9 to 93.2", "70 69.9 to 70.2; epsilon 0.1",
-         "30 29.9 to 30.2; by 0.9; optimum 34.5"],
-        ["83 82.9 to 83.2", "unknown", "unknown"],
-        ["43 42.9 to 43.2", "unknown", "-"],
-    ]  # fmt: skip
-    assert tables_of(agents[1:])["others"] is None
+LONG_NAMES = ["double_expected_sarsa_with_a_long_name", "an agent of many short words here", "x"]
+LARGE = -12_345_678.0
+
+
+def agents_table(console):
+    far = [made_up.estimate(LARGE, LARGE - 7654, LARGE + 1234) for _ in range(4)]
+    figures = dict(zip(("metric", "judged", "final", "area"), far, strict=True))
+    figures["metric"] = replace(made_up.agent("x", 1.0).metric, mean=far[0], median=far[1])
+    agents = [made_up.agent(name, 1000.0 * n, **figures) for n, name in enumerate(LONG_NAMES)]
+    place = made_up.environment(agents, optimum=123_456.0)
+    print_analysis(console, made_up.analysis([place], LONG_NAMES))
+
+
+def printed(table, width, is_terminal):
+    file = io.StringIO()
+    table(TextConsole(file=file, width=width, force_terminal=is_terminal, color_system=None))
+    return file.getvalue()
+
+
+def numbers(text):
+    return re.findall(r"[-+]?\d[\d,.]*", text.replace("\N{MINUS SIGN}", "-"))
+
+
+def test_no_digit_is_cut_and_no_column_missed_at_any_width():
+    whole = printed(agents_table, 400, False)
+    headings = {part.strip() for part in re.split("[┃│\n]", whole) if part.strip()}
+    headings = headings & {"IQM", "mean"}
+    for width in (40, 60, 72, 80):
+        for is_terminal in (False, True):
+            shown = printed(agents_table, width, is_terminal)
+            assert set(numbers(shown)) <= set(numbers(whole)), (width, is_terminal)
+            assert all(re.search(rf"\b{each}\b", shown) for each in headings)
+            rows = [line for line in shown.splitlines() if line[:1] in "┃│┏└"]
+            if width >= 60:
+                assert rows
+                assert max(map(len, rows)) <= width
+            assert "…" not in shown

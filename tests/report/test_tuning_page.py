@@ -13,7 +13,6 @@ from rl_yardstick.report.page.tuning import (
     cost,
     history,
     importances,
-    parallel,
     write_tuning_page,
 )
 
@@ -36,28 +35,6 @@ def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
     assert shown_of({**tuning_record, "lower_is_better": True})["best"] == [0.6] * 6
 
 
-EDGES = [
-    # Three quarters of 0.9, 0.96, 0.98, 1.0 reach from 0.945 to 1; 15 % of that is room.
-    ([0.2, 0.9, 0.96, 0.98, 1.0], {}, 0.9 - 0.015),
-    # The shipped settings are shown, where they double the axis at most.
-    ([0.85, 0.9, 0.95, 0.98, 1.0], {5: 0.0}, 0.85 - 0.0225),
-    # Trials that were ended early lie beyond, and have no say.
-    ([0.9, 0.95, 1.0], {3: 0.0, 4: 0.5}, 0.9 - 0.015),
-    ([0.9, 0.92, 0.98, 1.0], {}, None),  # all fit in
-    ([], {}, None),
-]
-
-
-@pytest.mark.parametrize("is_cost", [False, True])
-def test_the_axis_shows_where_the_best_are_told_apart(tuning_record, tuning_trial, is_cost):
-    sign = -1 if is_cost else 1
-    for values, pruned, edge in EDGES:
-        trials = [tuning_trial(n, sign * v, {"1": 0.0, "0": 0.0}) for n, v in enumerate(values)]
-        trials += [tuning_trial(n, sign * v, {"1": 0.0}, "pruned") for n, v in pruned.items()]
-        shown = shown_of({**tuning_record, "trials": trials, "lower_is_better": is_cost})
-        assert shown["edge"] == (None if edge is None else pytest.approx(sign * edge))
-
-
 def test_trials_are_ranked_by_value_and_those_with_the_optimum_by_their_steps(
     tuning_record, tuning_trial
 ):
@@ -71,20 +48,6 @@ def test_trials_are_ranked_by_value_and_those_with_the_optimum_by_their_steps(
     ):
         found = Trials({**tuning_record, **fields}).best_first
         assert [trial["number"] for trial in found] == ranked
-
-
-def test_lines_run_through_the_parameters_between_their_ends(tuning_record):
-    shown = parallel(Trials(tuning_record), {"steps": 1.0})
-    assert [axis["name"] for axis in shown["axes"]] == ["steps", "rate", "kind"]
-    assert shown["axes"][2]["ticks"] == [(1 / 6, "a"), (0.5, "null"), (5 / 6, "true")]
-    lines = {line["number"]: line for line in shown["lines"]}
-    # The geometric mean of the ends is in the middle.
-    assert lines[0]["at"] == [0.5, pytest.approx(0.5), 1 / 6]
-    assert (lines[3]["at"][0], lines[1]["at"][1]) == (1.0, 1.0)
-    assert lines[2]["said"] == ["3", "0.1", "null"]
-    # The worst first, so that the best are drawn over them.
-    assert [line["number"] for line in shown["lines"]] == [1, 0, 3, 6, 2]
-    assert [line["group"] for line in shown["lines"]] == [0, 1, 2, 3, 4]
 
 
 def test_the_parameter_that_decides_matters_most(tuning_record, tuning_trial):

@@ -1,4 +1,4 @@
-"""Pickles and zips that would run code, hide methods, or fill the memory: all are refused."""
+"""Pickles as data; those, and zips, that would run code or fill the memory are refused."""
 
 import base64
 import contextlib
@@ -22,10 +22,10 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.utils import ConstantSchedule
 
 from rl_yardstick.safe_files.buffers_and_statistics import load_replay_buffer, read_normalization
-from rl_yardstick.safe_files.files import UnsafeFileError, first_look
+from rl_yardstick.safe_files.files import Budget, UnsafeFileError, first_look
 from rl_yardstick.safe_files.known_objects import load_tensors, read_pickle
 from rl_yardstick.safe_files.models import inspect_model, load_model
-from rl_yardstick.safe_files.pickles import INSTRUCTIONS
+from rl_yardstick.safe_files.pickles import INSTRUCTIONS, Made, Name, Reader
 
 UTILS = "stable_baselines3.common.utils"
 START = b"\x80\x04"
@@ -34,6 +34,10 @@ MB = 1 << 20
 
 def text(value):
     return b"\x8c" + bytes([len(value)]) + value.encode()
+
+
+def long_text(value):
+    return b"X" + struct.pack("<I", len(value)) + value.encode()
 
 
 def name(module, qualname):
@@ -220,7 +224,7 @@ def tensors(content, **options):
     return file.getvalue()
 
 
-NOT_A_NUMBER = float("nan")
+NOT_A_NUMBER, OTHERS = float("nan"), {"policy.predict": th.zeros(1)}
 NO_ATTRIBUTE, NO_MEMBER, NO_MODEL = "no attribute of a", "which no model file has", "no such model"
 # What is changed in the settings, or put in place of a member; and what the refusal says.
 CHANGES = {
@@ -233,10 +237,7 @@ CHANGES = {
     "many environments": ({"n_envs": 10**9}, "n_steps|n_envs"),
     "a script": ({"extra.py": b""}, NO_MEMBER),
     "tensors by the name of a method": ({"predict.pth": tensors({})}, NO_MODEL),
-    "variables by that of another": (
-        {"pytorch_variables.pth": tensors({"policy.predict": th.zeros(1)})},
-        r"policy\.predict",
-    ),
+    "variables by that of another": ({"pytorch_variables.pth": tensors(OTHERS)}, r"y\.predict"),
     "no settings": ({"data": b""}, "settings that are no JSON"),
     "settings in settings": ({"data": b"[" * 100_000}, "settings that are no JSON"),
     "settings of nothing": ({"data": b"{}"}, NO_MODEL),
@@ -245,13 +246,11 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_no_model_has_is_refused(genuine, change):
-    assert isinstance(load(genuine), PPO)
     changes, message = CHANGES[change]
     is_member = all(isinstance(value, bytes) for value in changes.values())
     members = {**genuine, **changes} if is_member else with_settings(genuine, **changes)
-    with pytest.raises((UnsafeFileError, ValueError), match=message) as refusal:
+    with pytest.raises(UnsafeFileError, match=message):
         load(members)
-    assert isinstance(refusal.value, UnsafeFileError)
 
 
 def test_a_model_has_settings_and_tensors(genuine):
@@ -262,21 +261,15 @@ def test_a_model_has_settings_and_tensors(genuine):
 
 
 BIAS = "action_net.bias"
-WRONG_TENSORS = {
-    "a weight that is no number": lambda w: w.fill_(th.nan),
-    "a complex weight": lambda w: w + 1j,
-    "a weight of another shape": lambda w: th.zeros(3),
-    "a weight that is a list": lambda w: [0.0],
-}
 
 
-@pytest.mark.parametrize("wrong", WRONG_TENSORS)
-def test_tensors_that_such_a_model_does_not_have_are_refused(genuine, wrong):
+def test_tensors_that_such_a_model_does_not_have_are_refused(genuine):
     held = th.load(io.BytesIO(genuine["policy.pth"]), weights_only=True)
-    content = tensors({**held, BIAS: WRONG_TENSORS[wrong](held[BIAS])})
-    with pytest.raises(UnsafeFileError) as refusal:
-        load({**genuine, "policy.pth": content})
-    assert str(refusal.value).isprintable()
+    # No number, complex, of another shape, a list.
+    for wrong in (held[BIAS] * th.nan, held[BIAS] + 1j, th.zeros(3), [0.0]):
+        with pytest.raises(UnsafeFileError) as refusal:
+            load({**genuine, "policy.pth": tensors({**held, BIAS: wrong})})
+        assert str(refusal.value).isprintable()
 
 
 def with_members(content, **members):
@@ -320,9 +313,6 @@ def test_a_buffer_has_its_rows_in_the_file():
     content = io.BytesIO(pickle.dumps(agent.replay_buffer))
     with pytest.raises(UnsafeFileError, match="wrong observations"):
         load_replay_buffer(agent, content)
-
-
-# --- memory in proportion to the file ------------------------------------------------------------
 
 
 def peak_and_answer(load, *args):
@@ -394,21 +384,17 @@ def test_memory_is_in_proportion_to_statistics(attack):
     assert check_peak(attack, content, lambda stream: read_normalization(stream.read()))
 
 
-def pickled_text(value):
-    return b"X" + struct.pack("<I", len(value)) + value.encode()
-
-
 def integer(value):
     return b"J" + struct.pack("<i", value)
 
 
-PATH = pickled_text("0")
+PATH = long_text("0")
 
 
 def view(n_stored, said, offset, size, stride, kind="Float", key=PATH):
     """A file of one tensor, as PyTorch would write it if it were true."""
-    storage = b"(" + pickled_text("storage") + f"ctorch\n{kind}Storage\n".encode() + key
-    storage += pickled_text("cpu") + integer(said) + b"tQ"
+    storage = b"(" + long_text("storage") + f"ctorch\n{kind}Storage\n".encode() + key
+    storage += long_text("cpu") + integer(said) + b"tQ"
     sizes = integer(offset) + integer(size) + b"\x85" + integer(stride) + b"\x85"
     tensor = b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + sizes + b"\x89}tR."
     pickled = b"\x80\x02Nq\x000" + b"".join(b"h%ch%c\x86q%c0" % (i, i, i + 1) for i in range(32))
@@ -423,7 +409,7 @@ VIEWS = {
     "a place beyond its storage": view(1, 1, 10**9, 1, 1),
     "a negative size": view(1, 1, 0, -1, 1),
     "a kind that is not known": view(1, 1, 0, 1, 1, kind="Evil"),
-    "a record elsewhere": view(1, 1, 0, 1, 1, key=pickled_text("../x")),
+    "a record elsewhere": view(1, 1, 0, 1, 1, key=long_text("../x")),
     "a key that is huge once it is written out": view(1, 1, 0, 1, 1, key=b"h\x20"),
 }
 
@@ -465,3 +451,54 @@ def test_a_large_genuine_file_is_loaded_within_its_budget():
     content = zip_of(members_of(PPO("MlpPolicy", "CartPole-v1", device="cpu", **kwargs)))
     assert len(content) > 15 * MB
     assert check_peak("genuine", content, partial(load_model, PPO, device="cpu")) == ""
+
+
+KEYS = st.text(max_size=5) | st.integers(-(2**60), 2**60)
+VALUES = st.recursive(
+    KEYS | st.binary(max_size=5) | st.none() | st.booleans() | st.floats(allow_nan=False),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.lists(inner, max_size=4).map(tuple)
+        | st.dictionaries(KEYS, inner, max_size=4)
+    ),
+    max_leaves=20,
+)
+
+
+@settings(max_examples=30)
+@given(VALUES, st.integers(4, 5))
+def test_plain_data_comes_out_as_it_went_in(value, protocol):
+    assert read_pickle(pickle.dumps(value, protocol)) == value
+
+
+@given(VALUES, st.data())
+def test_cut_off_pickles_are_refused(value, data):
+    whole = pickle.dumps(value)
+    length = data.draw(st.integers(0, len(whole) - 1))
+    with pytest.raises(UnsafeFileError):
+        read_pickle(whole[:length])
+
+
+@given(st.binary(max_size=40))
+def test_any_bytes_are_data_or_refused(content):
+    with contextlib.suppress(UnsafeFileError):
+        read_pickle(content)
+
+
+def test_calls_and_names_are_written_down_and_not_made():
+    class Loud:
+        def __reduce__(self):
+            return print, ("called",)
+
+    call, name = Reader(io.BytesIO(pickle.dumps([Loud(), int])), Budget(0)).load()
+    assert isinstance(call, Made)
+    assert (call.name, call.args) == ("builtins.print", ("called",))
+    assert name == Name("builtins.int")
+
+
+@pytest.mark.parametrize("axes", [(0, 1, 2), (1, 2, 0)])
+def test_arrays_come_out_as_they_went_in(axes):
+    """Pictures with their channels in front are views with the axes in another order."""
+    array = np.arange(24, dtype=np.uint8).reshape(2, 3, 4).transpose(axes)
+    found = read_pickle(pickle.dumps(array))
+    assert (found.dtype, found.tolist()) == (array.dtype, array.tolist())

@@ -15,12 +15,9 @@ import numpy as np
 import pytest
 
 from rl_yardstick.agents import load_algorithm
-from rl_yardstick.envs.warehouse import WarehouseEnv
 from rl_yardstick.experiments.plan import plan
-from rl_yardstick.experiments.pool import do_run
-from rl_yardstick.experiments.results import read_episodes, read_results
+from rl_yardstick.experiments.results import read_episodes
 from rl_yardstick.experiments.study import read_study
-from rl_yardstick.mdp import value_iteration
 from rl_yardstick.pipeline.components import constructor_arguments
 
 ROOT = Path(__file__).parents[2]
@@ -47,14 +44,6 @@ def shrunk(whole, agents=None, environments=None, **changes):
         environments=chosen(whole.environments, environments),
         **changes,
     )
-
-
-def run(spec, folder):
-    """Do all runs of a study in this process; its results."""
-    planned = plan(spec, folder)
-    for one in planned:
-        do_run(one, "a test")
-    return read_results(spec, planned, folder)
 
 
 def training_returns(results, agent):
@@ -97,30 +86,25 @@ def test_the_guide_gives_the_command_of_each_study():
 
 
 # Mean and standard deviation over 100 seeds of the mean return of 500 episodes, by the last one.
-@pytest.mark.parametrize(
-    ("agent", "rows"),
-    [
-        (
-            "Q-learning as printed",
-            {500: (20.9, 3.0), 1500: (39.5, 19), 2500: (117, 47), 3500: (215, 63), 4500: (300, 86)},
-        ),
-        (
-            "SARSA as printed",
-            {500: (20.5, 2.6), 1500: (27.5, 11), 2500: (64, 34), 3500: (136, 58), 4500: (222, 67)},
-        ),
-    ],
-)
-def test_the_table_of_the_slides(tmp_path, agent, rows):
+SLIDES = {
+    "Q-learning": {500: (20.9, 3.0), 1500: (39.5, 19), 2500: (117, 47), 4500: (300, 86)},
+    "SARSA": {500: (20.5, 2.6), 1500: (27.5, 11), 2500: (64, 34), 4500: (222, 67)},
+}
+
+
+@pytest.mark.parametrize("name", SLIDES)
+def test_the_table_of_the_slides(do_study, tmp_path, name):
+    agent = f"{name} as printed"
     part = shrunk(study("cartpole-qlearning-vs-sarsa"), (agent,), n_seeds=4, eval_freq=-1)
-    returns = training_returns(run(part, tmp_path), agent)
+    returns = training_returns(do_study(part, tmp_path), agent)
     assert returns.shape == (4, 5000)
-    for end, (expected, spread) in rows.items():
+    for end, (expected, spread) in SLIDES[name].items():
         assert_mean(returns[:, end - 500 : end].mean(axis=1), expected, spread, 100)
 
 
-def test_the_warehouse_with_the_rewards_of_the_text(tmp_path):
+def test_the_warehouse_with_the_rewards_of_the_text(do_study, tmp_path):
     part = shrunk(study("warehouse-qlearning"), "as printed", "shelf -100", n_seeds=10)
-    results = run(part, tmp_path)
+    results = do_study(part, tmp_path)
     returns = training_returns(results, "as printed")
     # Over 30 seeds; the figures after +- are standard deviations of a seed's mean.
     for part_of, expected, spread in (
@@ -133,24 +117,9 @@ def test_the_warehouse_with_the_rewards_of_the_text(tmp_path):
     assert set(results.summary["final"]) == {79.0}
 
 
-def test_with_discount_a_tenth_the_best_actions_are_no_better_than_others():
-    """The exact values of actions at the start differ by less than a float can hold."""
-    model = WarehouseEnv(shelf_reward=-1).transition_model()
-    start = int(np.argmax(model.initial))
-    ties = {}
-    for discount, value in ((0.1, -1.1111), (0.5, -1.99995), (0.9, 2.0361)):
-        values = value_iteration(model, discount).values
-        assert values[start] == pytest.approx(value, abs=6e-5)
-        expected = model.reward[start] + discount * values[model.next_state[start]]
-        of_actions = np.sum(model.prob[start] * expected, axis=-1)
-        ties[discount] = np.count_nonzero(of_actions == of_actions.max())
-    assert ties[0.1] == 4
-    assert ties[0.9] < 4
-
-
-def test_the_8x8_lake_with_decaying_noise(tmp_path):
+def test_the_8x8_lake_with_decaying_noise(do_study, tmp_path):
     part = shrunk(study("frozenlake8x8-qlearning"), "as printed", "at most 99", n_seeds=20)
-    results = run(part, tmp_path)
+    results = do_study(part, tmp_path)
     returns = training_returns(results, "as printed")
     assert_mean(returns.mean(axis=1), 0.106, 0.070, 200)
     assert_mean(returns[:, -1000:].mean(axis=1), 0.203, 0.120, 200)
@@ -158,9 +127,9 @@ def test_the_8x8_lake_with_decaying_noise(tmp_path):
     assert (results.summary["final"] < 0.6353).all()
 
 
-def test_values_of_the_small_grid(tmp_path):
+def test_values_of_the_small_grid(do_study, tmp_path):
     part = shrunk(study("small-grid"), ("qlearning", "sarsa"), n_seeds=3)
-    results = run(part, tmp_path)
+    results = do_study(part, tmp_path)
     corner = {agent.label: [] for agent in part.agents}
     for one in results.planned:
         model = load_algorithm(one.agent).load(one.run.model_path(one.spec))

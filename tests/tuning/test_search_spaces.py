@@ -1,6 +1,5 @@
 """Search spaces: read strictly, asked by Optuna, and back from settings."""
 
-import math
 from functools import cache
 
 import gymnasium as gym
@@ -76,9 +75,6 @@ def as_run(algo, env_id):
     return shipped_entry(read_spec(algo, env_id, read_entry(algo, env_id)))
 
 
-# --- the files that come with the project ---------------------------------------------------------
-
-
 # Ranges are chosen so that what ships lies inside, but for what no range should hold.
 WIDENED = {("qrdqn", "FrozenLake-v1"): ("policy_kwargs.net_arch",)}  # no hidden layer
 
@@ -106,7 +102,8 @@ def test_an_agent_takes_every_end_and_every_choice(algo):
         spec = read_spec(algo, env.spec.id, space.merged(entry, drawn))
         kwargs = constructor_arguments(spec, algorithm, is_dict=False)
         if number < 2:
-            algorithm(env=env, **{**kwargs, **one_transition(kwargs)})
+            # Room for replay takes time to make, and its size is checked already.
+            algorithm(env=env, **kwargs | ({"buffer_size": 10} if "buffer_size" in kwargs else {}))
     env.close()
 
 
@@ -134,11 +131,6 @@ def test_batches_divide_the_buffer_of_steps(fixed, drawn, tried):
     assert {key: entry[key] for key in tried} == tried
 
 
-def one_transition(kwargs):
-    """Room for replay takes time to make, and its size is checked already."""
-    return {"buffer_size": 10} if "buffer_size" in kwargs else {}
-
-
 def environment_for(algo):
     for env_id in ("FrozenLake-v1", "GaussianBandit-v0", "Pendulum-v1", "Warehouse-v0"):
         env = gym.make(env_id)
@@ -148,60 +140,28 @@ def environment_for(algo):
     raise LookupError(algo)
 
 
-# --- settings and parameters ----------------------------------------------------------------------
-
-
 def test_what_optuna_chooses_becomes_settings(space):
-    params = {
-        "learning_rate_form": "exponential",
-        "learning_rate": 0.05,
-        "learning_rate_final_share": 0.1,
-        "gamma_form": "constant",
-        "one_minus_gamma": 0.005,
-        "log2_batch_size": 6,
-        "n_steps": 3,
-        "updates": "many",
-        "max_grad_norm": 10,
-        "exploration_fraction": 0.25,
-        "policy_kwargs.net_arch": "large",
-        "train_env_wrapper": "tenth",
-    }
+    same = {"n_steps": 3, "max_grad_norm": 10, "exploration_fraction": 0.25}
+    params = {"learning_rate_form": "exponential", "learning_rate": 0.05, "gamma_form": "constant"}
+    params |= {"learning_rate_final_share": 0.1, "one_minus_gamma": 0.005, "log2_batch_size": 6}
+    params |= {"updates": "many", "policy_kwargs.net_arch": "large", "train_env_wrapper": "tenth"}
+    params |= same
     settings = space.suggest(FixedTrial(params))
-    assert settings == {
-        "learning_rate": "exp_0.05_0.005",
-        "gamma": 0.995,
-        "batch_size": 64,
-        "n_steps": 3,
-        "train_freq": 4,
-        "gradient_steps": 8,
-        "max_grad_norm": 10,
-        "exploration_fraction": 0.25,
-        "policy_kwargs.net_arch": [64, 64],
-        "train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.1}},
-    }
+    found = {"learning_rate": "exp_0.05_0.005", "gamma": 0.995, "batch_size": 64, **same}
+    found |= {"train_freq": 4, "gradient_steps": 8, "policy_kwargs.net_arch": [64, 64]}
+    found |= {"train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.1}}}
+    assert settings == found
     settings = space.merged({}, settings)
     assert settings["policy_kwargs"] == {"net_arch": [64, 64]}
     assert close(space.including(settings)[1], params)
     assert params.keys() == space.distributions.keys()
 
 
-def test_an_environments_entry_changes_the_default(tmp_path):
-    ranges = read(tmp_path, DQN_SPACE, "Taxi-v4").distributions
-    assert "n_steps" not in ranges
-    assert ranges["exploration_fraction"].high == 0.2
-    assert ranges["log2_batch_size"].high == 7
-
-
 def test_what_does_not_exist_leaves_the_entry(space):
     settings = {"max_grad_norm": 1, "policy_kwargs.net_arch": [32]}
-    merged = space.merged(
-        {
-            "n_timesteps": 10,
-            "exploration_fraction": 0.5,
-            "policy_kwargs": {"net_arch": [8], "activation_fn": "nn.ReLU"},
-        },
-        settings,
-    )
+    entry = {"n_timesteps": 10, "exploration_fraction": 0.5}
+    entry["policy_kwargs"] = {"net_arch": [8], "activation_fn": "nn.ReLU"}
+    merged = space.merged(entry, settings)
     assert "exploration_fraction" not in merged
     assert merged["policy_kwargs"] == {"net_arch": [32], "activation_fn": "nn.ReLU"}
     assert merged["n_timesteps"] == 10
@@ -220,27 +180,18 @@ def test_every_setting_leads_back_to_itself(space):
 
 def close(first, second):
     """Equal, but for the digits after the sixth."""
-    return first.keys() == second.keys() and all(
-        math.isclose(value, second[name], rel_tol=1e-5)
-        if isinstance(value, float)
-        else value == second[name]
-        for name, value in first.items()
-    )
+    return first == {
+        name: pytest.approx(value, rel=1e-5) if isinstance(value, float) else value
+        for name, value in second.items()
+    }
 
 
 def test_settings_outside_widen_the_space(space):
-    entry = {
-        "learning_rate": 0.5,
-        "gamma": 0.5,
-        "batch_size": 100,
-        "train_freq": 2,
-        "gradient_steps": 2,
-        "max_grad_norm": 5,
-        "train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 7}},
-    }
-    assert (
-        space.including({**entry, "learning_rate": "falling"})[1]["learning_rate_form"] == "falling"
-    )
+    entry = {"learning_rate": 0.5, "gamma": 0.5, "batch_size": 100, "max_grad_norm": 5}
+    entry |= {"train_freq": 2, "gradient_steps": 2}
+    entry |= {"train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 7}}}
+    falling = space.including({**entry, "learning_rate": "falling"})[1]
+    assert falling["learning_rate_form"] == "falling"
     wider, params = space.including(entry)
     assert params["learning_rate"] == 0.5
     assert params["one_minus_gamma"] == 0.5
@@ -253,9 +204,6 @@ def test_settings_outside_widen_the_space(space):
     widened = {*entry, "updates", "policy_kwargs.net_arch"} - {"train_freq", "gradient_steps"}
     assert set(wider.widened) == widened
     assert wider.including(entry)[0] == wider
-
-
-# --- mistakes -------------------------------------------------------------------------------------
 
 
 MISTAKES = [

@@ -154,9 +154,6 @@ def test_what_the_user_fixes_is_not_searched(toy):
     assert len({p["learning_rate"] for p in params(search)}) == 10
 
 
-# --- where trials are stored ----------------------------------------------------------------------
-
-
 def test_the_storage_keeps_the_search(toy, monkeypatch):
     monkeypatch.setattr(searching, "open_storage", REAL_STORAGE)
     tuning = toy.tuning(n_trials=2, n_seeds=1)
@@ -166,9 +163,6 @@ def test_the_storage_keeps_the_search(toy, monkeypatch):
     (search.root / "trials.db").write_bytes(b"no database any more" * 100)
     with pytest.raises(UserError, match=r"trials\.db: file is not a database$"):
         toy.opened(tuning, "a {b} %20 c?d")
-
-
-# --- what a run and a setting are worth, worked out by hand ---------------------------------------
 
 
 VALUES = [
@@ -212,9 +206,6 @@ FIGURES_OF_RUNS = [
 def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value, steps):
     found = outcome(toy, monkeypatch, figure, **row)
     assert (found.figure, found.seconds, found.steps) == (value, 2.0, steps)
-
-
-# === what is ended early ==========================================================================
 
 
 def scored(scores, first=0):
@@ -265,9 +256,6 @@ def test_what_is_hopeless(scores, others, options, hopeless):
     assert found is hopeless
 
 
-# === what is tested again =========================================================================
-
-
 def retested(number, held_out, verdict):
     label = f"trial {number}" if number else "shipped"
     return Retested(label, number, 0.9, held_out, Estimate(held_out, 0.5, 0.9, 20), verdict, 20, 0)
@@ -308,9 +296,8 @@ def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):
     assert list(study.seeds) == list(range(1000, 1020))
     assert [agent.label for agent in study.agents] == ["shipped", *[label_of(e) for e in chosen]]
     for agent, each in zip(study.agents[1:], chosen, strict=True):
-        assert (
-            read_entry("qlearning", "FrozenLake-v1", agent.conf_file) == each.user_attrs[SETTINGS]
-        )
+        entry = read_entry("qlearning", "FrozenLake-v1", agent.conf_file)
+        assert entry == each.user_attrs[SETTINGS]
 
 
 def complete_trial(number, entry, figures):
