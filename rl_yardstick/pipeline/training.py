@@ -44,7 +44,7 @@ from rl_yardstick.pipeline.models import REPLAY_BUFFER, begun_with, load_to_trai
 from rl_yardstick.pipeline.pictures import draw
 from rl_yardstick.pipeline.run import FAILED, FINISHED, INTERRUPTED, Run, save_agent
 from rl_yardstick.pipeline.spec import TrainSpec
-from rl_yardstick.pipeline.watching import Watch, watch_of
+from rl_yardstick.pipeline.watching import TableRecorder, Watch, watch_of
 
 # What libraries raise for settings that they cannot work with.
 REFUSALS = (ValueError, TypeError, AssertionError, RuntimeError, MemoryError)  # of constructors
@@ -131,17 +131,17 @@ class Training:
             maps = ValueMapRecorder(run.path / "value_maps.npz", exact)
         evaluator, eval_env = self.judge.evaluator, self.judge.env
         self.evaluation = EvaluationCallback(run, eval_env, evaluator, frequencies, maps, critics)
-        # What a page plays of the training.
-        self.watch: Watch | None = watch_of(spec, agent, maps)
+        recorder = watch_of(spec, agent, maps)
+        self.watch: Watch | None = recorder  # what a page plays of the training
         self.pulls = PullRecorder(run.path) if is_bandit else None
         if is_bandit and getattr(agent, "engine", None) == "compiled":  # it stops at no pull
             self.pulls, note = None, "engine: compiled keeps no pulls, so regret is not known"
             run.console.print(note, style="dim")
         on_variant = bool(training_changes(spec))
         self.progress = ProgressCallback(run.console, spec.total_timesteps, on_variant)
-        self.callback = self._callbacks(resumes)
+        self.callback = self._callbacks(resumes, recorder)
 
-    def _callbacks(self, resumes: bool) -> CallbackList:
+    def _callbacks(self, resumes: bool, recorder: TableRecorder | None) -> CallbackList:
         """All callbacks, in the order in which they act.
 
         Numbers are checked before anything keeps them, and a saved state is put back before any
@@ -165,7 +165,7 @@ class Training:
             *(build(one, BaseCallback, "callback", typed, folder) for one in given),
             Checkpoint(every, **checkpoint) if every > 0 else None,
             Checkpoint(None, every_n_episodes, **checkpoint) if every_n_episodes > 0 else None,
-            *(self.pulls, self.evaluation.critics, self.watch, self.evaluation),
+            *(self.pulls, self.evaluation.critics, recorder, self.evaluation),
             EpisodeBudget(spec.n_episodes) if spec.n_episodes is not None else None,
             self.progress,
         ]
