@@ -190,7 +190,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("name", "arguments", "line"), REFUSED, ids=str)
+@pytest.mark.parametrize(("name", "arguments", "line"), REFUSED)
 def test_wrong_arguments(name, arguments, line):
     usual = "SegmentBandit-v0" if ALGORITHMS[name].for_bandits else "FrozenLake-v1"
     with pytest.raises((TypeError, ValueError), match=line) as refusal:
