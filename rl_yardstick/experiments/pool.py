@@ -117,6 +117,7 @@ class Workers:
         self.n_at_once, self.timeout = n_at_once, timeout
         self.words = f"{n_at_once} at once"
         self._pool: ProcessPool | None = None
+        self._under_way: list[Future[None]] = []
 
     def __enter__(self) -> Self:
         return self
@@ -128,17 +129,17 @@ class Workers:
         """Do a run as soon as a worker is free; the future raises what `do_run` raises."""
         if self._pool is None:
             self._pool = process_pool(self.n_at_once)
-        return self._pool.submit(do_run, self.timeout, planned, command)
+        future: Future[None] = self._pool.submit(do_run, self.timeout, planned, command)
+        self._under_way = [*(one for one in self._under_way if not one.done()), future]
+        return future
 
     def end(self) -> None:
         """Let running runs save their states, and end the workers."""
         if self._pool is not None:
-            workers = [p for p in multiprocessing.active_children() if p.name.startswith("pebble")]
-            for worker in workers:
-                worker.terminate()
-            deadline = time.monotonic() + GRACE
-            for worker in workers:
-                worker.join(max(deadline - time.monotonic(), 0.0))
+            for process in multiprocessing.active_children():
+                if process.name.startswith("pebble"):
+                    process.terminate()
+            wait(self._under_way, timeout=GRACE)
             self._pool.stop()  # type: ignore[no-untyped-call]
             self._pool.join()
             self._pool = None

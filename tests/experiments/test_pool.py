@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from rl_yardstick.experiments import pool
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.pool import ERROR_FILE, Workers, do_aside, do_run, do_runs
 from rl_yardstick.experiments.results import read_results
@@ -77,8 +76,7 @@ def test_a_run_that_takes_too_long_goes_on_later(walk, own_folder):
     assert not (run.path / "state.bin").exists()
 
 
-def test_a_stop_leaves_no_run_running(walk, monkeypatch):
-    monkeypatch.setattr(pool, "GRACE", 5.0)
+def test_a_stop_leaves_no_run_running(walk):
     _, runs = walk(3, 4, 5, n_timesteps=20_000)
     stop = Stop()
 
