@@ -179,10 +179,8 @@ def in_this_process(monkeypatch):
     """Studies whose runs are done by this process."""
     for place in ("experiments.pool", "report.page.learning"):
         monkeypatch.setattr(f"rl_yardstick.{place}.process_pool", Here)
-    for place in ("experiments.analysis", "report.page.world_sections"):
-        monkeypatch.setattr(
-            f"rl_yardstick.{place}.do_aside", lambda function, *args: function(*args)
-        )
+    place = "rl_yardstick.report.page.world_sections.do_aside"
+    monkeypatch.setattr(place, lambda function, *args: function(*args))
 
 
 @pytest.fixture(scope="session")

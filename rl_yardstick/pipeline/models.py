@@ -221,10 +221,10 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
     if env is not None:
         saved, here = zip_data(model.path).get("observation_space"), vars(env.observation_space)
         found, needed = (
-            one.get("n", tuple(one.get("_shape") or ())) if isinstance(one, dict) else None
+            str(one.get("n", tuple(one.get("_shape") or ()))) if isinstance(one, dict) else ""
             for one in (saved, here)
         )
-        if found not in (None, needed):
+        if found not in ("", needed):
             fault = f"{found}, and the environment here gives shape {needed}"
             raise UserError(
                 f"{model.path} was trained on observations of shape {fault}: give the right "

@@ -218,6 +218,7 @@ class Training:
             evaluation.write()
             if evaluation.value_maps is not None:
                 evaluation.value_maps.finish(agent)
+                self.watch = self.watch or evaluation.value_maps
             if evaluation.critics is not None:
                 evaluation.critics.finish(agent.num_timesteps)
             evaluation.take_statistics()

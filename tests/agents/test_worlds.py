@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents.compiled import worlds
 from rl_yardstick.agents.compiled.env_states import COMPENSATED_SUM
-from rl_yardstick.agents.compiled.loop import add_to_return, begin_episode
+from rl_yardstick.agents.compiled.loop import add_to_return, begin_episode, step
 from rl_yardstick.agents.compiled.references import handles_of, next_uniform
 from rl_yardstick.envs.wrappers import DiscretizeObservation
 from rl_yardstick.machine_code.compiling import kernel
@@ -20,7 +20,7 @@ from rl_yardstick.machine_code.compiling import kernel
 @numba.njit
 def step_each(records, world, terminated):
     for i in range(len(records)):
-        world.step(records[i], 0)
+        step(world, records[i], 0)
         terminated[i] = records[i].terminated
 
 

@@ -186,7 +186,7 @@ def test_the_shipped_changes_of_warehouses_cost_nothing(shape):
 
 
 def test_rewards_that_make_another_policy_optimal(shape):
-    words = ("--gamma", 0.9, "--train-env-kwargs", "reward_schedule:[1,-1,-0.5]")
+    words = ("-params", "gamma:0.9", "--train-env-kwargs", "reward_schedule:[1,-1,-0.5]")
     lines, data = shape("--env", "FrozenLake-v1", *words)
     assert lines[1].startswith("discount 0.9: NOT the same policies are optimal: the best actions")
     assert sum(place["gain"] for place in data["objectives"][0]["states"]) == pytest.approx(

@@ -188,8 +188,8 @@ LARGE = -12_345_678.0
 
 
 def agents_table(console):
-    far = [made_up.estimate(LARGE, LARGE - 7654, LARGE + 1234) for _ in range(4)]
-    figures = dict(zip(("metric", "judged", "final", "area"), far, strict=True))
+    far = [made_up.estimate(LARGE, LARGE - 7654, LARGE + 1234) for _ in range(3)]
+    figures = dict(zip(("metric", "judged", "final"), far, strict=True))
     figures["metric"] = replace(made_up.agent("x", 1.0).metric, mean=far[0], median=far[1])
     agents = [made_up.agent(name, 1000.0 * n, **figures) for n, name in enumerate(LONG_NAMES)]
     place = made_up.environment(agents, optimum=123_456.0)
