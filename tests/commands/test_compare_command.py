@@ -259,7 +259,7 @@ default:
 BLIND = "FrozenLake-v1: {n_episodes: 600, learning_rate: 0.1, gamma: 0.0}"
 SEARCH = """
 --env FrozenLake-v1 --env-kwargs is_slippery:False --algo qlearning --n-episodes 600
---search-space space.yml --conf-file blind.yml --storage sqlite:///trials.db -j 1 --no-report
+--search-space space.yml --conf-file blind.yml -j 1 --no-report
 --trials 4 --seeds-per-trial 1 --n-startup-trials 3 --retest 1 --retest-seeds 8
 --until-decided --max-retest-seeds 12
 """
