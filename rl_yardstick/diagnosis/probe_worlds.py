@@ -33,7 +33,6 @@ class World:
     quits: float = 0.0  # probability that the first state ends the episode, with a reward of 0
     noise: float = 0.0  # added to or subtracted from each reward, with equal probability
     pays_after: int = 0  # number of first steps of training that have a reward of 0
-    in_place: bool = False  # each observation is the same array, changed in place
 
     @property
     def n_states(self) -> int:
@@ -68,6 +67,11 @@ class Record:
     actions: list[int] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
 
+    def clear(self) -> None:
+        """Forget all."""
+        for kept in (self.states, self.actions, self.rewards):
+            kept.clear()
+
     def counts(self) -> NDArray[np.int64]:
         """How often each action was taken in each state, shape (S, 2)."""
         counts = np.zeros((self.n_states, N_ACTIONS), np.int64)
@@ -93,7 +97,6 @@ class ProbeEnv(gym.Env[Any, Any]):
         self.observation_space = spaces.Discrete(n) if self.is_discrete else vectors
         self.action_space = spaces.Discrete(N_ACTIONS) if actions == "discrete" else numbers
         self.state = 0
-        self._shown = np.zeros(n, np.float32)
 
     def observation_of(self, state: int) -> Any:
         """The observation of a state: its index, or a one-hot vector."""
@@ -101,12 +104,6 @@ class ProbeEnv(gym.Env[Any, Any]):
             return state
         vector: NDArray[np.float32] = np.eye(self.n_observations, dtype=np.float32)[state]
         return vector
-
-    def _observe(self, state: int) -> Any:
-        if self.is_discrete or not self.world.in_place:
-            return self.observation_of(state)
-        self._shown[:] = self.observation_of(state)
-        return self._shown
 
     def action_masks(self) -> NDArray[np.bool_]:
         """All actions are allowed: for agents that use masks."""
@@ -118,7 +115,7 @@ class ProbeEnv(gym.Env[Any, Any]):
         """Begin in state 0."""
         super().reset(seed=seed)
         self.state = 0
-        return self._observe(0), {}
+        return self.observation_of(0), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Go to the next state, and record the step."""
@@ -135,7 +132,7 @@ class ProbeEnv(gym.Env[Any, Any]):
         self.record.actions.append(action)
         self.record.rewards.append(reward)
         self.state = following
-        return self._observe(following), reward, terminated, False, {}
+        return self.observation_of(following), reward, terminated, False, {}
 
 
 class ModelledProbeEnv(ProbeEnv):

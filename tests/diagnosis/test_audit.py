@@ -48,7 +48,6 @@ OF_TABLES = {  # the fault: what has it, what that claims to be, and the probe t
     "not-reproducible": (sarsa, "sarsa", agent_probes.probe_seeds),
     "schedule-backwards": (q_learning, "q_learning", agent_probes.probe_exploration),
     "schedule-constant": (q_learning, "q_learning", agent_probes.probe_exploration),
-    "shared-buffer": (planted.from_memory, "q_learning", target_probes.probe_copies),
     "stale-buffer": (planted.from_memory, "q_learning", target_probes.probe_age),
     "n-step-return": (planted.several_steps, "sarsa", target_probes.probe_n_steps),
     "traces, never-cut": (q_learning, "q_learning", target_probes.probe_traces),
@@ -68,8 +67,7 @@ OF_CLASSES = {  # a class: its fault, and the probe that sees it
     "PPOEntropy": ("entropy-sign", agent_probes.probe_entropy),
 }
 RIGHT_CLASSES = {
-    "dqn": [target_probes.probe_target_network, target_probes.probe_copies,
-            agent_probes.probe_files],
+    "dqn": [target_probes.probe_target_network, agent_probes.probe_files],
     "ppo": [target_probes.probe_ratio],
 }  # fmt: skip
 
@@ -112,7 +110,6 @@ def test_faults_of_classes_are_named(name):
 
 @pytest.mark.parametrize("name", RIGHT_CLASSES)
 def test_right_classes_pass(name):
-    """DQN too where DummyVecEnv keeps no copy of an episode's last observation."""
     assert {found.state for found in audit(of_class(name), [0], RIGHT_CLASSES[name])} == {"ok"}
 
 
