@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.mdp.transition_model import Floats
 
-Observations = Literal["discrete", "box"]
-Actions = Literal["discrete", "box"]
+SpaceKind = Literal["discrete", "box"]  # of observations, or of actions
 
 N_ACTIONS = 2
 
@@ -47,30 +46,19 @@ class World:
             return state, False
         return self.n_states if self.end_shows is None else self.end_shows, True
 
-    def values(self, gamma: float) -> Floats:
-        """The exact value of each state under the best actions, shape (S,)."""
-        best = [max(pays) for pays in self.pays]
-        values = np.zeros(self.n_states)
-        values[-1] = best[-1] if self.ends else best[-1] / (1 - gamma)
-        for state in range(self.n_states - 2, -1, -1):
-            values[state] = best[state] + gamma * values[state + 1]
-        values[0] *= 1 - self.quits
-        return values
-
 
 @dataclass
 class Record:
-    """States, actions and rewards of a training in a world, over all copies of its environment."""
+    """States and actions of a training in a world, over all copies of its environment."""
 
     n_states: int
     states: list[int] = field(default_factory=list)
     actions: list[int] = field(default_factory=list)
-    rewards: list[float] = field(default_factory=list)
 
     def clear(self) -> None:
         """Forget all."""
-        for kept in (self.states, self.actions, self.rewards):
-            kept.clear()
+        self.states.clear()
+        self.actions.clear()
 
     def counts(self) -> NDArray[np.int64]:
         """How often each action was taken in each state, shape (S, 2)."""
@@ -87,7 +75,7 @@ class ProbeEnv(gym.Env[Any, Any]):
     """
 
     def __init__(
-        self, world: World, record: Record, observations: Observations, actions: Actions
+        self, world: World, record: Record, observations: SpaceKind, actions: SpaceKind
     ) -> None:
         self.world, self.record = world, record
         self.n_observations = world.n_states + 1
@@ -130,7 +118,6 @@ class ProbeEnv(gym.Env[Any, Any]):
             reward = 0.0
         self.record.states.append(self.state)
         self.record.actions.append(action)
-        self.record.rewards.append(reward)
         self.state = following
         return self.observation_of(following), reward, terminated, False, {}
 
@@ -166,7 +153,7 @@ def action_number(action: Any, space: spaces.Space[Any]) -> int:
 
 
 def make_env(
-    world: World, record: Record, observations: Observations, actions: Actions
+    world: World, record: Record, observations: SpaceKind, actions: SpaceKind
 ) -> gym.Env[Any, Any]:
     """An environment of this world; its steps are appended to the record."""
     is_modelled = observations == actions == "discrete" and not (world.noise or world.pays_after)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from rl_yardstick.agents.registry import ALGORITHMS, AlgorithmEntry, load_algorithm
 from rl_yardstick.diagnosis.faults import KINDS, Target
 from rl_yardstick.diagnosis.probe_worlds import (
-    Actions,
-    Observations,
     ProbeEnv,
     Record,
+    SpaceKind,
     World,
     action_number,
     make_env,
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
 
 GAMMA = 0.8
 
-Spaces = tuple[Observations | None, Actions | None]
+Spaces = tuple[SpaceKind | None, SpaceKind | None]
 
 # Settings of all audits, unless others are given: full exploration, and targets of one step.
 BASE: Mapping[str, Any] = {
@@ -108,10 +107,11 @@ class Subject(ABC):
     steps = 2000  # of the environment, after which values are read first
     target: Target | None = None  # the kind of its targets; None where that is not known
     uses_ratio = False  # whether it uses importance sampling, for a greedy target policy
+    ancestors: Sequence[str] = ()  # names of its class and base classes; none for a script
     is_on_policy = False  # whether it learns from rollouts, as the library's on-policy agents do
     has_values = True  # whether its values can be read
     stepwise: Mapping[str, str] = {}  # settings under which ours calls its environment at each step
-    spaces: tuple[Observations, Actions]  # the kinds of observations and actions
+    spaces: tuple[SpaceKind, SpaceKind]  # the kinds of observations and actions
     parameters: Mapping[str, inspect.Parameter]
 
     def __init__(self, name: str, kind: str | None) -> None:
@@ -133,10 +133,6 @@ class Subject(ABC):
     def accepts(self, setting: str) -> bool:
         """Whether the learner has this setting."""
         return self.named(setting) is not None
-
-    def descends_from(self, name: str) -> bool:
-        """Whether the class or one of its base classes has this name; never for a script."""
-        return False
 
     def settings(self, changes: Mapping[str, Any], **defaults: Any) -> dict[str, Any]:
         """All settings under the learner's own names; a copy, since learners write into them."""
@@ -220,11 +216,8 @@ _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
 class ClassSubject(Subject):
     """A subclass of Stable-Baselines3's `BaseAlgorithm`, an agent of the registry.
 
-    Args:
-        name: of the agent; see also `register_class`.
-        typed: settings that the user gave.
-        kind: what it claims to be, among `KINDS`; None: as its family.
-        wanted: kinds of observations and actions; None: the first that works.
+    ``kind`` is what it claims to be (default: as its family), ``wanted`` the kinds of observations
+    and actions (default: the first that works).
     """
 
     def __init__(
@@ -245,31 +238,23 @@ class ClassSubject(Subject):
         for key in typed:
             if key not in known:
                 raise unknown(f"{name} has no hyperparameter", key, known)
-        self._set_family()
+        # what the family claims to be, and settings that learn tiny worlds fast
+        self.ancestors = [ancestor.__name__ for ancestor in self.cls.__mro__]
+        family = next((name for name in self.ancestors if name in _FAMILIES), None)
+        if family is not None:
+            target, self.steps, settings = _FAMILIES[family]
+            self.base |= settings
+            self.target = self.target or target
+        self.uses_ratio |= family == "OffPolicyMonteCarlo"
+        self.is_on_policy = "OnPolicyAlgorithm" in self.ancestors
+        if self.is_on_policy:
+            self.target = "states"
         if "=interpreted" in known.get("engine", []) and "engine" not in typed:
             self.stepwise = {"engine": "interpreted"}
         arguments = check_arguments(name, typed)
         spec = validated({"algo": name, "env_id": "", "algorithm": arguments})
         self.typed = constructor_arguments(spec, self.cls, is_dict=False)
         self.find_spaces(wanted)
-
-    def _set_family(self) -> None:
-        """Set the settings that learn tiny worlds fast, and what the family claims to be."""
-        from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-
-        names = (ancestor.__name__ for ancestor in self.cls.__mro__)
-        family = next((name for name in names if name in _FAMILIES), None)
-        if family is not None:
-            target, self.steps, settings = _FAMILIES[family]
-            self.base |= settings
-            self.target = self.target or target
-        self.uses_ratio |= family == "OffPolicyMonteCarlo"
-        self.is_on_policy = issubclass(self.cls, OnPolicyAlgorithm)
-        if self.is_on_policy:
-            self.target = "states"
-
-    def descends_from(self, name: str) -> bool:
-        return name in {ancestor.__name__ for ancestor in self.cls.__mro__}
 
     def model_for(self, trained: Trained, seed: int, changes: Mapping[str, Any]) -> Any:
         from stable_baselines3.common.logger import Logger
@@ -306,8 +291,7 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     policy, batch = model.policy, np.stack(observations)
     for holder in (policy, model):
         if isinstance(table := getattr(holder, "q_table", None), np.ndarray) and batch.ndim == 1:
-            values: Floats = np.asarray(table, dtype=np.float64)[batch]
-            return values
+            return np.asarray(table[batch], dtype=np.float64)
     if callable(getattr(model, "values", None)):
         return np.stack([np.ravel(model.values(obs)) for obs in observations]).astype(float)
     if not (hasattr(policy, "lstm_critic") or hasattr(policy, "critic")):

@@ -76,7 +76,7 @@ def one_step(
         traces[obs, action] = 1.0
         q += learning_rate * error * traces
         traces *= fading
-        is_cut = target == "max" and not is_greedy and fault != "never-cut"
+        is_cut = target == "max" and not is_greedy
         if is_cut or (done and fault != "kept-across-episodes"):
             traces[:] = 0.0
         obs, action = following, choose(following) if done else next_action
