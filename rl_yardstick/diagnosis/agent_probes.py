@@ -14,7 +14,7 @@ import numpy as np
 
 from rl_yardstick.diagnosis.faults import UNEXPLAINED, Finding, checked
 from rl_yardstick.diagnosis.probe_worlds import ARM_0, CHAIN, SAFE_FORK, World
-from rl_yardstick.diagnosis.subjects import ClassSubject, Lab, Subject, Trained, TrainedModel
+from rl_yardstick.diagnosis.subjects import ClassSubject, Lab, Subject, Trained
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import one_line
 
@@ -45,7 +45,6 @@ def probe_entropy(lab: Lab) -> Finding | None:
     spreads = []
     for weight in (1e-3, 0.5):
         trained = lab.begin(World(((0, 0),)), ent_coef=weight)
-        assert isinstance(trained, TrainedModel)
         spreads.append(float(trained.drawn_actions(0, 1000).std()))
     low, high = spreads
     text = f"actions vary by {low:.2f} with a weight of 0.001, and by {high:.2f} with 0.5"
@@ -92,7 +91,7 @@ def _moves(lab: Lab, subject: ClassSubject, schedule: Any) -> tuple[float, float
     """How much values move from one reading to the next, early in a training and late."""
     from stable_baselines3.common.callbacks import BaseCallback
 
-    trained = subject.start(World(((0, 0),), noise=1.0), lab.seed, {"learning_rate": schedule})
+    trained = Trained(subject, World(((0, 0),), noise=1.0), lab.seed, {"learning_rate": schedule})
     rollout = int({**subject.base, **subject.typed}.get("n_steps", 1))
     every = max(20, rollout) if subject.is_on_policy else 20
     readings: list[Floats] = []
@@ -175,7 +174,7 @@ def _held_by_both(one: Trained, other: Trained) -> str:
     from stable_baselines3.common.buffers import BaseBuffer
 
     kinds = (BaseBuffer, np.ndarray, th.Tensor, th.nn.Module, list, dict, deque)
-    mine, theirs = (vars(getattr(each, "model", None) or each) for each in (one, other))
+    mine, theirs = (vars(each.model) for each in (one, other))
     held = (name for name, value in mine.items() if isinstance(value, kinds))
     return next((name for name in held if mine[name] is theirs.get(name)), "")
 
@@ -191,7 +190,6 @@ def probe_files(lab: Lab) -> Finding | None:
     if (rate := _learning_rate(subject)) is not None:
         changes["learning_rate"] = LinearSchedule(rate, rate / 20, 1.0)
     trained = lab.begin(CHAIN, 300, **changes)
-    assert isinstance(trained, TrainedModel)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "model.zip")
         try:
@@ -206,7 +204,7 @@ def probe_files(lab: Lab) -> Finding | None:
     return Finding("ok", "values, optimizers and schedules are the same after loading")
 
 
-def _lost(trained: TrainedModel, loaded: Any) -> dict[str, str]:
+def _lost(trained: Trained, loaded: Any) -> dict[str, str]:
     """What a loaded model has lost, by fault."""
     lost, model, before = {}, trained.model, trained.values()
     trained.model = loaded

@@ -21,7 +21,6 @@ PROBES: Mapping[Probe, str] = {
     target_probes.probe_ratio: "the importance ratio",
     target_probes.probe_target_network: "the target network",
     target_probes.probe_age: "the age of training data",
-    target_probes.probe_copies: "observations that change in place",
     target_probes.probe_n_steps: "targets of several steps",
     target_probes.probe_advantages: "advantages of rollouts",
     target_probes.probe_traces: "traces",
@@ -90,7 +89,7 @@ def audit(
     other seeds, and the majority counts.
     """
     labs = [Lab(subject, seed) for seed in seeds]
-    reads_values = {*list(PROBES)[:11], agent_probes.probe_schedules}
+    reads_values = {*list(PROBES)[:10], agent_probes.probe_schedules}
     if not subject.has_values:
         text = "it has no values, so its targets cannot be checked"
         yield Finding("skipped", text, probe="its values")

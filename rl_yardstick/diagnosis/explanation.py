@@ -25,7 +25,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -55,9 +54,7 @@ from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.policies import own_values
 from rl_yardstick.pipeline.spec import TrainSpec
 
-MOST_OUTCOMES = (
-    500_000  # of a model to plan in for an agent's objective, which takes about a second
-)
+MOST_OUTCOMES = 500_000  # of a model to plan in for an agent's objective: about a second
 TIE = 1e-9  # action values within this of the best, relative to it, count as ties
 MOST_STATES, MOST_OF_GAP = 3, 0.5  # states are named where these many make up this share of the gap
 SURELY = 0.99  # the probability of an end from which on it counts as sure
@@ -147,6 +144,7 @@ class Explanation:
         }
 
 
+# The function from a state to its name, and the names of all actions.
 _Names = tuple[Callable[[int], str], tuple[str, ...]]
 
 
@@ -191,7 +189,9 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
     task = _task(spec, agent, evaluator)
     found = Found(evaluator, agent, policy, split, task)
     with closing(make_single_env(spec)) as env:
-        names = _names(env, evaluator)
+        known = action_names(env)
+        more = (f"action {action}" for action in range(len(known), evaluator.model.n_actions))
+        names = partial(state_name, env, evaluator.layout), (*known, *more)
         alike = None if found.groups is None else found.alike(names)
         explained = replace(
             explained,
@@ -222,13 +222,6 @@ def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _
     if explores and getattr(agent, "exploration", "") == "epsilon_greedy":
         epsilon = float(getattr(agent, "exploration_rate", 0.0))
     return _Task(model, float(discount), epsilon, _noisy(model, epsilon) if epsilon > 0 else model)
-
-
-def _names(env: gym.Env[Any, Any], evaluator: ExactEvaluator) -> _Names:
-    """The function from a state to its name, and the names of all actions."""
-    known = action_names(env)
-    more = (f"action {action}" for action in range(len(known), evaluator.model.n_actions))
-    return partial(state_name, env, evaluator.layout), (*known, *more)
 
 
 class Found:

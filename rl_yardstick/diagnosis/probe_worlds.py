@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.mdp.transition_model import Floats
 
-Observations = Literal["discrete", "box"]
-Actions = Literal["discrete", "box"]
+SpaceKind = Literal["discrete", "box"]  # of observations, or of actions
 
 N_ACTIONS = 2
 
@@ -33,7 +32,6 @@ class World:
     quits: float = 0.0  # probability that the first state ends the episode, with a reward of 0
     noise: float = 0.0  # added to or subtracted from each reward, with equal probability
     pays_after: int = 0  # number of first steps of training that have a reward of 0
-    in_place: bool = False  # each observation is the same array, changed in place
 
     @property
     def n_states(self) -> int:
@@ -48,25 +46,19 @@ class World:
             return state, False
         return self.n_states if self.end_shows is None else self.end_shows, True
 
-    def values(self, gamma: float) -> Floats:
-        """The exact value of each state under the best actions, shape (S,)."""
-        best = [max(pays) for pays in self.pays]
-        values = np.zeros(self.n_states)
-        values[-1] = best[-1] if self.ends else best[-1] / (1 - gamma)
-        for state in range(self.n_states - 2, -1, -1):
-            values[state] = best[state] + gamma * values[state + 1]
-        values[0] *= 1 - self.quits
-        return values
-
 
 @dataclass
 class Record:
-    """States, actions and rewards of a training in a world, over all copies of its environment."""
+    """States and actions of a training in a world, over all copies of its environment."""
 
     n_states: int
     states: list[int] = field(default_factory=list)
     actions: list[int] = field(default_factory=list)
-    rewards: list[float] = field(default_factory=list)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self.states.clear()
+        self.actions.clear()
 
     def counts(self) -> NDArray[np.int64]:
         """How often each action was taken in each state, shape (S, 2)."""
@@ -83,7 +75,7 @@ class ProbeEnv(gym.Env[Any, Any]):
     """
 
     def __init__(
-        self, world: World, record: Record, observations: Observations, actions: Actions
+        self, world: World, record: Record, observations: SpaceKind, actions: SpaceKind
     ) -> None:
         self.world, self.record = world, record
         self.n_observations = world.n_states + 1
@@ -93,7 +85,6 @@ class ProbeEnv(gym.Env[Any, Any]):
         self.observation_space = spaces.Discrete(n) if self.is_discrete else vectors
         self.action_space = spaces.Discrete(N_ACTIONS) if actions == "discrete" else numbers
         self.state = 0
-        self._shown = np.zeros(n, np.float32)
 
     def observation_of(self, state: int) -> Any:
         """The observation of a state: its index, or a one-hot vector."""
@@ -101,12 +92,6 @@ class ProbeEnv(gym.Env[Any, Any]):
             return state
         vector: NDArray[np.float32] = np.eye(self.n_observations, dtype=np.float32)[state]
         return vector
-
-    def _observe(self, state: int) -> Any:
-        if self.is_discrete or not self.world.in_place:
-            return self.observation_of(state)
-        self._shown[:] = self.observation_of(state)
-        return self._shown
 
     def action_masks(self) -> NDArray[np.bool_]:
         """All actions are allowed: for agents that use masks."""
@@ -118,7 +103,7 @@ class ProbeEnv(gym.Env[Any, Any]):
         """Begin in state 0."""
         super().reset(seed=seed)
         self.state = 0
-        return self._observe(0), {}
+        return self.observation_of(0), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Go to the next state, and record the step."""
@@ -133,9 +118,8 @@ class ProbeEnv(gym.Env[Any, Any]):
             reward = 0.0
         self.record.states.append(self.state)
         self.record.actions.append(action)
-        self.record.rewards.append(reward)
         self.state = following
-        return self._observe(following), reward, terminated, False, {}
+        return self.observation_of(following), reward, terminated, False, {}
 
 
 class ModelledProbeEnv(ProbeEnv):
@@ -169,7 +153,7 @@ def action_number(action: Any, space: spaces.Space[Any]) -> int:
 
 
 def make_env(
-    world: World, record: Record, observations: Observations, actions: Actions
+    world: World, record: Record, observations: SpaceKind, actions: SpaceKind
 ) -> gym.Env[Any, Any]:
     """An environment of this world; its steps are appended to the record."""
     is_modelled = observations == actions == "discrete" and not (world.noise or world.pays_after)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,14 +13,14 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rl_yardstick.agents.registry import ALGORITHMS, AlgorithmEntry, load_algorithm
 from rl_yardstick.diagnosis.faults import KINDS, Target
 from rl_yardstick.diagnosis.probe_worlds import (
-    Actions,
-    Observations,
     ProbeEnv,
     Record,
+    SpaceKind,
     World,
     action_number,
     make_env,
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 GAMMA = 0.8
 
-Spaces = tuple[Observations | None, Actions | None]
+Spaces = tuple[SpaceKind | None, SpaceKind | None]
 
 # Settings of all audits, unless others are given: full exploration, and targets of one step.
 BASE: Mapping[str, Any] = {
@@ -57,24 +57,36 @@ OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-class Trained(ABC):
-    """A learner that is trained in a world."""
+class Trained:
+    """A learner that is trained in a world, with some settings changed."""
 
-    def __init__(self, world: World, spaces: tuple[Observations, Actions]) -> None:
+    def __init__(
+        self, subject: Subject, world: World, seed: int, changes: Mapping[str, Any]
+    ) -> None:
         self.world, self.record = world, Record(world.n_states)
-        self._env = ProbeEnv(world, self.record, *spaces)
+        self._env = ProbeEnv(world, self.record, *subject.spaces)
+        self.model = subject.model_for(self, seed, changes)
 
-    @abstractmethod
+    def train(self, steps: int, callback: BaseCallback | None = None) -> None:
+        """Train for that many more steps."""
+        is_first = not self.model.num_timesteps
+        self.model.learn(steps, callback=callback, reset_num_timesteps=is_first)
+
     def act(self, state: int) -> int:
         """The action in a state when evaluated."""
+        observation = np.asarray(self._env.observation_of(state))
+        action, _ = self.model.predict(observation, deterministic=True)
+        return action_number(action, self._env.action_space)
 
-    @abstractmethod
+    def drawn_actions(self, state: int, n: int) -> Floats:
+        """Actions as they are drawn in training, numbers of shape (n,)."""
+        observations = np.stack([np.asarray(self._env.observation_of(state))] * n)
+        actions, _ = self.model.predict(observations, deterministic=False)
+        return np.asarray(actions, dtype=np.float64).reshape(n)
+
     def values(self) -> Floats | None:
         """Its values, shape (S, 2) of actions or (S, 1) of states; None where it has none."""
-
-    @abstractmethod
-    def train(self, steps: int) -> None:
-        """Train for that many more steps."""
+        return values_of(self.model, [*map(self._env.observation_of, range(self.world.n_states))])
 
     def state_values(self) -> Floats:
         """State values, shape (S,): action values are averaged over the actions taken."""
@@ -95,10 +107,11 @@ class Subject(ABC):
     steps = 2000  # of the environment, after which values are read first
     target: Target | None = None  # the kind of its targets; None where that is not known
     uses_ratio = False  # whether it uses importance sampling, for a greedy target policy
+    ancestors: Sequence[str] = ()  # names of its class and base classes; none for a script
     is_on_policy = False  # whether it learns from rollouts, as the library's on-policy agents do
     has_values = True  # whether its values can be read
     stepwise: Mapping[str, str] = {}  # settings under which ours calls its environment at each step
-    spaces: tuple[Observations, Actions]  # the kinds of observations and actions
+    spaces: tuple[SpaceKind, SpaceKind]  # the kinds of observations and actions
     parameters: Mapping[str, inspect.Parameter]
 
     def __init__(self, name: str, kind: str | None) -> None:
@@ -109,8 +122,8 @@ class Subject(ABC):
             self.uses_ratio = kind == "off_policy_monte_carlo"
 
     @abstractmethod
-    def start(self, world: World, seed: int, changes: Mapping[str, Any]) -> Trained:
-        """A learner with some settings changed, before its training."""
+    def model_for(self, trained: Trained, seed: int, changes: Mapping[str, Any]) -> Any:
+        """The model that is to be trained, with some settings changed."""
 
     def named(self, setting: str) -> str | None:
         """The learner's name for this setting; None where it has no such setting."""
@@ -120,10 +133,6 @@ class Subject(ABC):
     def accepts(self, setting: str) -> bool:
         """Whether the learner has this setting."""
         return self.named(setting) is not None
-
-    def descends_from(self, name: str) -> bool:
-        """Whether the class or one of its base classes has this name; never for a script."""
-        return False
 
     def settings(self, changes: Mapping[str, Any], **defaults: Any) -> dict[str, Any]:
         """All settings under the learner's own names; a copy, since learners write into them."""
@@ -137,7 +146,7 @@ class Subject(ABC):
         known: Any = ("discrete", "box")
         for self.spaces in product(*(known if one is None else (one,) for one in wanted)):
             try:
-                trained = self.start(World(((0, 0), (1, 1))), 0, {})
+                trained = Trained(self, World(((0, 0), (1, 1))), 0, {})
                 trained.train(40)
                 trained.act(0)
                 self.has_values = trained.values() is not None
@@ -207,11 +216,8 @@ _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
 class ClassSubject(Subject):
     """A subclass of Stable-Baselines3's `BaseAlgorithm`, an agent of the registry.
 
-    Args:
-        name: of the agent; see also `register_class`.
-        typed: settings that the user gave.
-        kind: what it claims to be, among `KINDS`; None: as its family.
-        wanted: kinds of observations and actions; None: the first that works.
+    ``kind`` is what it claims to be (default: as its family), ``wanted`` the kinds of observations
+    and actions (default: the first that works).
     """
 
     def __init__(
@@ -232,7 +238,17 @@ class ClassSubject(Subject):
         for key in typed:
             if key not in known:
                 raise unknown(f"{name} has no hyperparameter", key, known)
-        self._set_family()
+        # what the family claims to be, and settings that learn tiny worlds fast
+        self.ancestors = [ancestor.__name__ for ancestor in self.cls.__mro__]
+        family = next((name for name in self.ancestors if name in _FAMILIES), None)
+        if family is not None:
+            target, self.steps, settings = _FAMILIES[family]
+            self.base |= settings
+            self.target = self.target or target
+        self.uses_ratio |= family == "OffPolicyMonteCarlo"
+        self.is_on_policy = "OnPolicyAlgorithm" in self.ancestors
+        if self.is_on_policy:
+            self.target = "states"
         if "=interpreted" in known.get("engine", []) and "engine" not in typed:
             self.stepwise = {"engine": "interpreted"}
         arguments = check_arguments(name, typed)
@@ -240,28 +256,14 @@ class ClassSubject(Subject):
         self.typed = constructor_arguments(spec, self.cls, is_dict=False)
         self.find_spaces(wanted)
 
-    def _set_family(self) -> None:
-        """Set the settings that learn tiny worlds fast, and what the family claims to be."""
-        from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-        from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+    def model_for(self, trained: Trained, seed: int, changes: Mapping[str, Any]) -> Any:
+        from stable_baselines3.common.logger import Logger
 
-        names = (ancestor.__name__ for ancestor in self.cls.__mro__)
-        family = next((name for name in names if name in _FAMILIES), None)
-        if family is not None:
-            target, self.steps, settings = _FAMILIES[family]
-            self.base |= settings
-            self.target = self.target or target
-        self.uses_ratio |= family == "OffPolicyMonteCarlo"
-        self.is_on_policy = issubclass(self.cls, OnPolicyAlgorithm)
-        self.has_network = self.is_on_policy or issubclass(self.cls, OffPolicyAlgorithm)
-        if self.is_on_policy:
-            self.target = "states"
-
-    def descends_from(self, name: str) -> bool:
-        return name in {ancestor.__name__ for ancestor in self.cls.__mro__}
-
-    def start(self, world: World, seed: int, changes: Mapping[str, Any]) -> TrainedModel:
-        return TrainedModel(self, world, seed, changes)
+        settings = self.settings(changes, gamma=GAMMA, seed=seed, device="cpu")
+        env = make_env(trained.world, trained.record, *self.spaces)
+        model = self.cls(env=env, **settings)
+        model.set_logger(Logger(folder=None, output_formats=[]))
+        return model
 
 
 def register_class(name: str) -> None:
@@ -280,40 +282,6 @@ def register_class(name: str) -> None:
     ALGORITHMS[name] = AlgorithmEntry(name, attribute)
 
 
-class TrainedModel(Trained):
-    """A `BaseAlgorithm` that is trained in a world."""
-
-    def __init__(
-        self, subject: ClassSubject, world: World, seed: int, changes: Mapping[str, Any]
-    ) -> None:
-        from stable_baselines3.common.logger import Logger
-
-        super().__init__(world, subject.spaces)
-        settings = subject.settings(changes, gamma=GAMMA, seed=seed, device="cpu")
-        env = make_env(world, self.record, *subject.spaces)
-        self.model = subject.cls(env=env, **settings)
-        self.model.set_logger(Logger(folder=None, output_formats=[]))
-
-    def train(self, steps: int, callback: BaseCallback | None = None) -> None:
-        is_first = not self.model.num_timesteps
-        self.model.learn(steps, callback=callback, reset_num_timesteps=is_first)
-
-    def act(self, state: int) -> int:
-        observation = np.asarray(self._env.observation_of(state))
-        action, _ = self.model.predict(observation, deterministic=True)
-        return action_number(action, self._env.action_space)
-
-    def drawn_actions(self, state: int, n: int) -> Floats:
-        """Actions as they are drawn in training, numbers of shape (n,)."""
-        observations = np.stack([np.asarray(self._env.observation_of(state))] * n)
-        actions, _ = self.model.predict(observations, deterministic=False)
-        return np.asarray(actions, dtype=np.float64).reshape(n)
-
-    def values(self) -> Floats | None:
-        states = range(self.world.n_states)
-        return values_of(self.model, [np.asarray(self._env.observation_of(s)) for s in states])
-
-
 def values_of(model: Any, observations: list[Any]) -> Floats | None:
     """A model's values at observations, shape (n, 2) or (n, 1); None where it has none."""
     import torch as th
@@ -323,10 +291,9 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     policy, batch = model.policy, np.stack(observations)
     for holder in (policy, model):
         if isinstance(table := getattr(holder, "q_table", None), np.ndarray) and batch.ndim == 1:
-            values: Floats = np.asarray(table, dtype=np.float64)[batch]
-            return values
+            return np.asarray(table[batch], dtype=np.float64)
     if callable(getattr(model, "values", None)):
-        return np.stack([np.atleast_1d(model.values(obs)) for obs in observations]).astype(float)
+        return np.stack([np.ravel(model.values(obs)) for obs in observations]).astype(float)
     if not (hasattr(policy, "lstm_critic") or hasattr(policy, "critic")):
         found = own_values(model, batch)
         return None if found is None else found.reshape(len(batch), -1)
@@ -385,43 +352,32 @@ class ScriptSubject(Subject):
                 raise unknown(f"-params: unknown argument of {name}", key, self.parameters)
         self.find_spaces(wanted)
 
-    def start(self, world: World, seed: int, changes: Mapping[str, Any]) -> TrainedScript:
-        return TrainedScript(self, world, seed, changes)
+    def model_for(self, trained: Trained, seed: int, changes: Mapping[str, Any]) -> ScriptModel:
+        make = partial(make_env, trained.world, trained.record, *self.spaces)
+        settings = {"seed": seed, "gamma": GAMMA, **self.settings(changes)}
+        return ScriptModel(partial(self.function, make_env=make, **settings), trained.record)
 
 
-class TrainedScript(Trained):
-    """The agent that a script's function returned; more training starts from the beginning."""
+class ScriptModel:
+    """What a function trains, asked as the library's models are."""
 
-    def __init__(
-        self, subject: ScriptSubject, world: World, seed: int, changes: Mapping[str, Any]
-    ) -> None:
-        super().__init__(world, subject.spaces)
-        self.subject, self.seed = subject, seed
-        self.settings = subject.settings(changes)
-        self.agent: Any = None
-        self.steps = 0
+    policy, num_timesteps = None, 0
 
-    def train(self, steps: int) -> None:
-        self.steps += steps
-        self.record = Record(self.world.n_states)
-        self.agent = self.subject.function(
-            make_env=partial(make_env, self.world, self.record, *self.subject.spaces),
-            seed=self.seed,
-            **{"gamma": GAMMA, "steps": self.steps, **self.settings},
-        )
-        if not callable(getattr(self.agent, "act", None)):
-            raise UserError(f"{self.subject.name} must return something with act(obs)")
+    def __init__(self, train: Callable[..., Any], record: Record) -> None:
+        self._train, self._record = train, record
 
-    def act(self, state: int) -> int:
-        return action_number(
-            self.agent.act(self._env.observation_of(state)), self._env.action_space
-        )
+    def learn(self, steps: int, **_: Any) -> None:
+        """Train for that many more steps, from the beginning."""
+        self.num_timesteps += steps
+        self._record.clear()
+        agent = self._train(steps=self.num_timesteps)
+        if not callable(getattr(agent, "act", None)):
+            raise UserError("a script's function must return something with act(obs)")
+        self._act, self.values = agent.act, getattr(agent, "values", None)
 
-    def values(self) -> Floats | None:
-        if not callable(getattr(self.agent, "values", None)):
-            return None
-        found = [self.agent.values(self._env.observation_of(s)) for s in range(self.world.n_states)]
-        return np.stack([np.asarray(each, dtype=np.float64).reshape(-1) for each in found])
+    def predict(self, observation: NDArray[Any], **_: Any) -> tuple[Any, None]:
+        """The action at an observation."""
+        return self._act(observation if observation.ndim else int(observation)), None
 
 
 # --- trainings whose values are read --------------------------------------------------------------
@@ -443,7 +399,7 @@ class Lab:
 
     def begin(self, world: World, steps: int | None = None, **changes: Any) -> Trained:
         """Train for some steps."""
-        trained = self.subject.start(world, self.seed, changes)
+        trained = Trained(self.subject, world, self.seed, changes)
         trained.train(self.subject.steps if steps is None else steps)
         return trained
 

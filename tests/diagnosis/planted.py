@@ -76,7 +76,7 @@ def one_step(
         traces[obs, action] = 1.0
         q += learning_rate * error * traces
         traces *= fading
-        is_cut = target == "max" and not is_greedy and fault != "never-cut"
+        is_cut = target == "max" and not is_greedy
         if is_cut or (done and fault != "kept-across-episodes"):
             traces[:] = 0.0
         obs, action = following, choose(following) if done else next_action
@@ -91,11 +91,9 @@ def from_memory(make_env, seed, gamma, steps, buffer_size=500, *, fault=""):
     memory = []
     obs, _ = env.reset(seed=seed)
     for _ in range(steps):
-        kept = obs if fault == "shared-buffer" else obs.copy()
         action = int(rng.integers(q.shape[1]))
         following, reward, terminated, truncated, _ = env.step(action)
-        next_kept = following if fault == "shared-buffer" else following.copy()
-        item = (kept, action, reward, next_kept, terminated)
+        item = (obs, action, reward, following, terminated)
         if len(memory) < buffer_size:
             memory.append(item)
         elif fault != "stale-buffer":

@@ -8,9 +8,7 @@ import pytest
 from rl_yardstick.diagnosis import agent_probes, target_probes
 from rl_yardstick.diagnosis.audit import Verdict, audit
 from rl_yardstick.diagnosis.faults import FAULTS, Finding
-from rl_yardstick.diagnosis.probe_worlds import Record, World
-from rl_yardstick.diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, register_class
-from rl_yardstick.diagnosis.target_probes import watkins_table
+from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject, register_class
 from tests.diagnosis import planted
 
 q_learning, sarsa = (partial(planted.one_step, target=target) for target in ("max", "next"))
@@ -48,10 +46,8 @@ OF_TABLES = {  # the fault: what has it, what that claims to be, and the probe t
     "not-reproducible": (sarsa, "sarsa", agent_probes.probe_seeds),
     "schedule-backwards": (q_learning, "q_learning", agent_probes.probe_exploration),
     "schedule-constant": (q_learning, "q_learning", agent_probes.probe_exploration),
-    "shared-buffer": (planted.from_memory, "q_learning", target_probes.probe_copies),
     "stale-buffer": (planted.from_memory, "q_learning", target_probes.probe_age),
     "n-step-return": (planted.several_steps, "sarsa", target_probes.probe_n_steps),
-    "traces, never-cut": (q_learning, "q_learning", target_probes.probe_traces),
     "traces, lambda-alone": (sarsa, "sarsa", target_probes.probe_traces),
     "traces, kept-across-episodes": (sarsa, "sarsa", target_probes.probe_traces),
     "advantage-sign": (planted.preferences, "actor_critic", agent_probes.probe_choice),
@@ -68,8 +64,7 @@ OF_CLASSES = {  # a class: its fault, and the probe that sees it
     "PPOEntropy": ("entropy-sign", agent_probes.probe_entropy),
 }
 RIGHT_CLASSES = {
-    "dqn": [target_probes.probe_target_network, target_probes.probe_copies,
-            agent_probes.probe_files],
+    "dqn": [target_probes.probe_target_network, agent_probes.probe_files],
     "ppo": [target_probes.probe_ratio],
 }  # fmt: skip
 
@@ -112,7 +107,6 @@ def test_faults_of_classes_are_named(name):
 
 @pytest.mark.parametrize("name", RIGHT_CLASSES)
 def test_right_classes_pass(name):
-    """DQN too where DummyVecEnv keeps no copy of an episode's last observation."""
     assert {found.state for found in audit(of_class(name), [0], RIGHT_CLASSES[name])} == {"ok"}
 
 
@@ -142,17 +136,3 @@ def test_seeds_that_disagree_decide_nothing():
 
     found = list(audit(script(q_learning), range(3), [moody]))
     assert [(f.state, f.text) for f in found] == [("unsaid", "seeds disagree: ok, traces, unsaid")]
-
-
-def test_a_table_of_watkins_by_hand():
-    """Two episodes; in the second, exploring in the middle state cuts what led there."""
-    world = World(((0, 0), (1, -1), (1, 1)))
-    record = Record(3, [0, 1, 2, 0, 1, 2], [0, 0, 0, 0, 1, 0], [0, 1, 1, 0, -1, 1])
-    first = [0.5 * 0.4 * 1 + 0.5 * 0.16 * 1, 0.5 + 0.5 * 0.4, 0.5]
-    cut = watkins_table(world, record, 0.5, is_cut=True)
-    whole = watkins_table(world, record, 0.5, is_cut=False)
-    start = first[0] + 0.5 * (GAMMA * first[1] - first[0])
-    np.testing.assert_allclose(cut[:, 0], [start, first[1], 0.75])
-    error = -1 + GAMMA * first[2]
-    moved = start + 0.5 * (0.4 * error + 0.16 * 0.5)
-    np.testing.assert_allclose(whole[:, 0], [moved, first[1], 0.75])
