@@ -316,7 +316,7 @@ class LimitedEpisodes:
         model, states = self.model, self._visited()
         moments = self.along_ways(states, discount, ends_well)
         is_large = len(states) * self.horizon > MOST_BACKWARDS
-        if moments is None and is_large and self._is_stationary():
+        if moments is None and is_large and not np.issubdtype(self.policy.dtype, np.integer):
             rows = model.prob, model.next_state, model.terminated, model.reward, ends_well
             start = self.policy.astype(np.float64), model.initial
             found = moments_by_spreading(rows, *start, self.horizon, discount, floor)
@@ -355,15 +355,12 @@ class LimitedEpisodes:
         place[states] = np.arange(len(states))
         return place
 
-    def _is_stationary(self) -> bool:
-        return not np.issubdtype(self.policy.dtype, np.integer)
-
     def along_ways(self, states: Ints, discount: float, ends_well: Bools) -> Floats | None:
         """The moments, if each of the n states has one outcome; None if a state has more.
 
         The states must be closed under the policy; shape (n, 5) as `moments_under_limit`.
         """
-        if not self._is_stationary():
+        if np.issubdtype(self.policy.dtype, np.integer):
             return None
         action = self.policy[states].argmax(axis=1)
         at = states, action, self.model.prob[states, action].argmax(axis=1)

@@ -96,10 +96,6 @@ def filled(columns: Sequence[Column], rows: Sequence[Row]) -> list[tuple[Column,
     return [(column, [cell or dash for cell in cells]) for column, cells in found if any(cells)]
 
 
-def _median(row: Row) -> Cell:
-    return estimate_cell(row.agent.metric.median)
-
-
 def _score(row: Row) -> Cell | None:
     if row.agent.score is None:
         return None
@@ -182,7 +178,9 @@ def _by_pulls(cell: Callable[[PullStatistics], Cell]) -> Callable[[Row], Cell | 
 COLUMNS = (
     Column(lambda row: estimate_cell(row.agent.metric.mean), "Mean", "over seeds", None, "mean"),
     Column(lambda row: number_cell(row.agent.metric.iqm), "IQM", "middle half"),
-    Column(_median, "Median", "over seeds", None, "median"),
+    Column(
+        lambda row: estimate_cell(row.agent.metric.median), "Median", "over seeds", None, "median"
+    ),
     Column(_score, "Score", "1 is optimal", "descending", "score"),
     Column(_failed, "Failed", "runs below {failed}", "ascending", "failed"),
     Column(_gap, "Gap", "to the optimum", "ascending"),
@@ -209,14 +207,6 @@ def _other_return(returns: Estimate | None, words: str) -> Cell:
     return replace(cell, note="; ".join(filter(None, (cell.note, words))))
 
 
-def _greedy(row: Row) -> Cell:
-    return estimate_cell(row.agent.final)
-
-
-def _stochastic(row: Row) -> Cell:
-    return _other_return(row.agent.stochastic, row.agent.acts_by)
-
-
 def _discounted(row: Row) -> Cell | None:
     discount, optimum = row.agent.discount, row.agent.discounted_optimum
     if discount is None:  # an agent that has none
@@ -227,8 +217,18 @@ def _discounted(row: Row) -> Cell | None:
 
 # On the page, folded below the ranking.
 OTHER_RETURNS = (
-    Column(_greedy, "Greedy", "the final policy's return", "descending"),
-    Column(_stochastic, "Stochastic", "as it acts in training", "descending"),
+    Column(
+        lambda row: estimate_cell(row.agent.final),
+        "Greedy",
+        "the final policy's return",
+        "descending",
+    ),
+    Column(
+        lambda row: _other_return(row.agent.stochastic, row.agent.acts_by),
+        "Stochastic",
+        "as it acts in training",
+        "descending",
+    ),
     Column(_discounted, "Discounted", "greedy, under its own discount", "descending"),
 )
 

@@ -245,8 +245,7 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
         *speed_sentences(environment),
         *_on_what_cannot_be_compared(study, environment),
         *on_changes([environment]),
-        *_on_missing(study, environment),
-        *_on_looks(environment),
+        *_on_runs(study, environment),
     ]
     pairs = tuple(pair_sentences(environment))
     return Conclusion(_lead(study, environment), pairs, tuple(notes))
@@ -367,15 +366,8 @@ def on_changes(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
     return [f"{MARK}: trained on a changed environment: {'; '.join(told)}."] if told else []
 
 
-def _on_looks(environment: EnvironmentAnalysis) -> Iterator[str]:
-    """How often a growing study is looked at."""
-    if n := len(environment.looks):
-        looks = "1 look" if n == 1 else f"up to {n} looks"
-        sizes = enumeration([f"{size:,}" for size in environment.looks])
-        yield f"Agents got more seeds until they were decided: {looks}, at {sizes} seeds."
-
-
-def _on_missing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterator[str]:
+def _on_runs(study: StudySpec, environment: EnvironmentAnalysis) -> Iterator[str]:
+    """Which runs are missing, and how often a growing study is looked at."""
     for agent, n_missing in environment.missing.items():
         n_seeds = environment.seeds.get(agent, study.n_seeds)
         if n_missing == n_seeds:
@@ -383,3 +375,7 @@ def _on_missing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterator[
         elif n_missing:
             verb = "is" if n_missing == 1 else "are"
             yield f"{n_missing} of {n_seeds} runs of {agent} {verb} missing."
+    if n := len(environment.looks):
+        looks = "1 look" if n == 1 else f"up to {n} looks"
+        sizes = enumeration([f"{size:,}" for size in environment.looks])
+        yield f"Agents got more seeds until they were decided: {looks}, at {sizes} seeds."

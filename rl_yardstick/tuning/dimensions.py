@@ -57,7 +57,8 @@ class Range:
             raise ValueError(f"scale log needs low above 0, not {low}")
         if self.scale == "log_below_one" and high >= 1:
             raise ValueError(f"scale log_below_one needs high below 1, not {high}")
-        if self.scale == "powers_of_two" and not (is_power(low) and is_power(high)):
+        powers = (isinstance(n, int) and n > 0 and n.bit_count() == 1 for n in (low, high))
+        if self.scale == "powers_of_two" and not all(powers):
             raise ValueError("scale powers_of_two needs whole powers of two as low and high")
         if not 0 < share[0] < share[1] < np.inf:
             raise ValueError("final_share must be two numbers above 0, the smaller one first")
@@ -217,11 +218,6 @@ def ends(distribution: BaseDistribution) -> list[Any]:
 def tidy(number: float) -> float:
     """Round a number to six digits."""
     return float(f"{number:.6g}")
-
-
-def is_power(number: float) -> bool:
-    """Whether a number is a whole power of two."""
-    return isinstance(number, int) and number > 0 and number.bit_count() == 1
 
 
 def _read(value: Any) -> tuple[str | None, float, float]:

@@ -248,13 +248,6 @@ def sum_of(weights: Floats, tiles: Ints, action: int) -> float:
 
 
 @called
-def move_sum(weights: Floats, tiles: Ints, action: int, step: float) -> None:
-    """Move the sum of an action's weights over the tiles by a step."""
-    for k in range(len(tiles)):
-        weights[tiles[k], action] += step
-
-
-@called
 def add_up(agent: LinearAgent, tiles: Ints) -> None:
     """Fill ``agent.room.sums`` with the sum of each action's weights over the tiles."""
     sums = agent.room.sums
