@@ -143,10 +143,6 @@ def _stays_from(row: Row) -> Cell | None:
     return replace(cell, aside=aside)
 
 
-def _episodes(row: Row) -> Cell | None:
-    return threshold_cell(row.agent.episodes_to_stay)
-
-
 def _seconds(row: Row) -> Cell | None:
     seconds = row.agent.seconds
     if math.isnan(seconds.point):
@@ -187,7 +183,12 @@ COLUMNS = (
     Column(_training, terminal="training"),
     Column(_success, "Success", "in the end", "descending"),
     Column(_stays_from, "Stays from", "step, at {threshold}", "ascending", "stays from"),
-    Column(_episodes, "Episodes", "to stay at {threshold}", "ascending"),
+    Column(
+        lambda row: threshold_cell(row.agent.episodes_to_stay),
+        "Episodes",
+        "to stay at {threshold}",
+        "ascending",
+    ),
     Column(_seconds, "CPU time", "seconds of training", "ascending", "CPU time"),
     Column(_runs, "Runs", "finished", "descending"),
 )

@@ -12,11 +12,11 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from rl_yardstick.agents.common.schedules import schedule_value
-from rl_yardstick.machine_code.cache import RULE_PREFIX
 from rl_yardstick.machine_code.compiling import (
     INLINED_OPTIONS,
     IS_INTERPRETED,
     PART_OPTIONS,
+    RULE_PREFIX,
     PartCompiler,
     inlined,
     kernel,

@@ -19,8 +19,14 @@ from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
-from rl_yardstick.agents.linear.algorithm import TileAlgorithm
-from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, choose, look, sum_of
+from rl_yardstick.agents.linear.algorithm import (
+    LinearAgent,
+    TileAlgorithm,
+    add_up,
+    choose,
+    look,
+    sum_of,
+)
 from rl_yardstick.machine_code.compiling import called
 from rl_yardstick.mdp.transition_model import Floats
 

@@ -18,8 +18,7 @@ from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE
 from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import NotCompilable
-from rl_yardstick.agents.linear.algorithm import TileAlgorithm
-from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, look
+from rl_yardstick.agents.linear.algorithm import LinearAgent, TileAlgorithm, add_up, look
 from rl_yardstick.envs.known_models import time_limit
 from rl_yardstick.machine_code.compiling import called
 from rl_yardstick.mdp.transition_model import Floats, Ints

@@ -43,7 +43,7 @@ from rl_yardstick.agents.networks.engine import (
     network_player,
 )
 from rl_yardstick.agents.networks.perceptron import Inputs, one_thread
-from rl_yardstick.machine_code.cache import folder
+from rl_yardstick.machine_code.compiling import folder
 
 # Conditions for compiled trainings of the library's agents.
 
@@ -316,7 +316,7 @@ class CompiledNetworks(BaseAlgorithm):
                         self._training.close()
                     self._training, self._sharing = None, False
         else:
-            self._learn_compiled(*plan.world, **given.arguments)
+            self._learn_compiled(plan.world, **given.arguments)
         return self
 
     def engine_plan(
@@ -383,8 +383,7 @@ class CompiledNetworks(BaseAlgorithm):
 
     def _learn_compiled(
         self,
-        world: Any,
-        seen: Any,
+        world: tuple[Any, Any],  # the environments as compiled code, and how to read them
         total_timesteps: int,
         callback: Any,
         log_interval: int | None,
@@ -399,8 +398,8 @@ class CompiledNetworks(BaseAlgorithm):
         if self.num_timesteps < total_timesteps:
             # An interrupted run restores its last state here.
             callback.on_rollout_start()
-            with one_thread(), closing(self.training_kind(self, seen)) as training:
-                NetworkEngine(training, world, callback, log_interval).run(total_timesteps)
+            with one_thread(), closing(self.training_kind(self, world[1])) as training:
+                NetworkEngine(training, world[0], callback, log_interval).run(total_timesteps)
         callback.on_training_end()
 
     def get_parameters(self) -> dict[str, dict[str, Any]]:

@@ -115,7 +115,10 @@ class MaskedTables(NamedTuple):
         """The k-th allowed action."""
         return int(room.actions[k])
 
-    with_mean_values = average_tables
+    @inlined
+    def with_mean_values(self, obs: int, room: Room) -> Room:
+        """The means of the tables, in the room."""
+        return average_tables(self, obs, room)
 
 
 # Acting on a table of action values, and moving its entries towards their targets.

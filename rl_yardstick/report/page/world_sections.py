@@ -32,8 +32,7 @@ from rl_yardstick.report.series import (
     mean_regret,
     regret_of_runs,
 )
-from rl_yardstick.report.why import whys_of
-from rl_yardstick.report.words import number
+from rl_yardstick.report.words import number, whys_of
 
 MOST_ARMS = 40  # over all contexts, in a table or in a figure
 
