@@ -5,14 +5,12 @@ call. A function that only compiled functions call needs no machine code of its 
 for Python and C: such a `Part` is compiled to LLVM's intermediate representation (IR), and from
 there into the code of each caller.
 
-Numba discards the cached code of a function when the function's own file changes, but not when an
-inlined function of another file does. So all code is in a folder named by a digest of every source
-that it depends on, and of the versions of Python, Numba and NumPy. Numba itself keeps the code of
-different processors apart. Code with other sources, such as a user's update rule, is not cached.
+Numba discards cached code when the function's own file changes, but not when the file of an inlined
+function does. So all code is in a folder named by a digest of every source and of the versions of
+the compilers. Code with other sources, such as a user's update rule, is not cached.
 """
 
 # mypy: allow-untyped-calls
-# Numba's classes and functions are not typed.
 
 from __future__ import annotations
 
@@ -42,16 +40,13 @@ from numba.core.types import unliteral
 from rl_yardstick.machine_code import WorkTime
 
 ROOT = Path(__file__).resolve().parent.parent  # the folder of `rl_yardstick`, with all packages
-
 # The packages with compiled functions; their machine code depends on no other package.
 COMPILED = ("agents", "machine_code", "mdp")
 OWN_MODULES = tuple(f"rl_yardstick.{package}." for package in COMPILED)
 
 KEPT_BESIDE = 3  # folders of other digests to keep, for switching between versions
-
 # The first field of a settings record starts with this; the algorithm's module and class follow.
 RULE_PREFIX = "rule "
-
 logger = logging.getLogger(__name__)
 
 
@@ -152,8 +147,7 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 IS_INTERPRETED: bool = bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
 
-# Division by zero follows IEEE 754 and raises nothing: checks for it would hinder the compiler in
-# optimising across calls.
+# Division by zero follows IEEE 754 and raises nothing: checks for it hinder the optimiser.
 OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 
 # Without reference counts, which cost a loop of small steps more than the steps themselves. Safe
@@ -162,8 +156,7 @@ BARE_OPTIONS: dict[str, Any] = {**OPTIONS, "_nrt": False}
 
 INLINED_OPTIONS: dict[str, Any] = {**BARE_OPTIONS, "forceinline": True}
 
-# Without the wrapper that unpacks the arrays of a call from Python, which takes longer to compile
-# than a loop.
+# Without the wrapper that unpacks the arrays of a call, which takes longer to compile than a loop.
 PART_OPTIONS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
