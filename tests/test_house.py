@@ -14,7 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from rl_yardstick.machine_code.cache import COMPILED
+from rl_yardstick.machine_code.compiling import COMPILED
 
 ROOT = Path(__file__).resolve().parent.parent
 HOUSE = ROOT / "rl_yardstick"

@@ -8,7 +8,6 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.bandits.algorithm import BINARY, BanditAlgorithm, Pull
 from rl_yardstick.agents.bandits.linear import features
@@ -37,17 +36,11 @@ KINDS = {
 class MABWiserPolicy(TablePolicy):
     """Holds a `mabwiser.mab.MAB` over arms numbered from 0, and saves its objects as one tensor."""
 
-    def __init__(
-        self,
-        *args: Any,
-        kind: str = "EpsilonGreedy",
-        settings: dict[str, float] | None = None,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, *args: Any, kind: str, settings: dict[str, float], **kwargs: Any) -> None:
         from mabwiser.mab import MAB, LearningPolicy
 
         super().__init__(*args, **kwargs)
-        self.kind, self.settings = kind, settings or {}
+        self.kind, self.settings = kind, settings
         self.statistics = KINDS[kind].statistics
         arms = range(int(self.action_space.n))  # type: ignore[attr-defined]
         self.mab: Any = MAB(list(arms), getattr(LearningPolicy, kind)(**self.settings))
@@ -125,12 +118,9 @@ class MABWiserAgent(BanditAlgorithm):
     hidden_arguments = ("learning_rate", "mask_actions", "tie_breaking")
 
     def __init__(
-        self,
-        policy: str | type[BasePolicy] = "MABWiserPolicy",
-        env: GymEnv | str | None = None,
-        **kwargs: Any,
+        self, policy: str | type[BasePolicy] = "MABWiserPolicy", *args: Any, **kwargs: Any
     ) -> None:
-        super().__init__(policy, env, tie_breaking="first", **kwargs)
+        super().__init__(policy, *args, tie_breaking="first", **kwargs)
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -146,14 +136,14 @@ class MABWiserAgent(BanditAlgorithm):
     def _contexts(self, obs: NDArray[Any]) -> Floats:
         return features(self.observation_space, obs)
 
-    def _first_pull(self) -> int | None:
-        """An arm to pull instead of the library's choice, which needs a reward first."""
-        return None if self.policy.fitted else 0
-
     def _choose(  # type: ignore[override]  # the library knows no masks
         self, contexts: Floats, rng: np.random.Generator
     ) -> tuple[Ints, Floats]:
-        first, mab = self._first_pull(), self.policy.mab
+        # The library needs a reward first, and would take an untried arm's mean reward for 0.
+        mab, first = self.policy.mab, None if self.policy.fitted else 0
+        if self.kind == "UCB1":
+            counts = mab._imp.arm_to_count
+            first = next((arm for arm in mab.arms if counts[arm] == 0), None)
         mab._rng.rng = rng
         told = [() if self.policy.statistics else (context[None],) for context in contexts]
         arms = [int(mab.predict(*each)) if first is None else first for each in told]
@@ -183,11 +173,6 @@ class MABWiserUCB1(MABWiserAgent):
     def __init__(self, *args: Any, c: float = 1.0, **kwargs: Any) -> None:
         self.c = c
         super().__init__(*args, **kwargs)
-
-    def _first_pull(self) -> int | None:
-        """An untried arm: the library would take its mean reward for 0 and neglect it."""
-        counts = self.policy.mab._imp.arm_to_count
-        return next((arm for arm in self.policy.mab.arms if counts[arm] == 0), None)
 
 
 class MABWiserThompson(MABWiserAgent):

@@ -1,7 +1,8 @@
-"""Agents that plan on the known transition model, as an upper bound for the others.
+"""Agents that do not learn from rewards: fixed policies as baselines, and planners.
 
-`learn` plans first. It then plays the policy, so that callbacks, Monitor and logger get the same
-calls as from any other agent.
+Planners know the transition model, and are an upper bound for the others: `learn` plans first. It
+then plays the policy, so that callbacks, Monitor and logger get the same calls as from any other
+agent.
 """
 
 from __future__ import annotations
@@ -35,6 +36,63 @@ from rl_yardstick.mdp import (
     value_iteration,
 )
 from rl_yardstick.mdp.transition_model import Bools, Ints
+
+POLE_ANGLE = 2
+LEFT, RIGHT = 0, 1
+
+
+class RandomPolicy(TablePolicy):
+    """Uniformly random actions from the action space's own generator."""
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        first = next(iter(observation.values())) if isinstance(observation, dict) else observation
+        return th.from_numpy(np.stack([self.action_space.sample() for _ in range(len(first))]))
+
+
+class AnglePolicy(TablePolicy):
+    """Push the cart towards the side that the pole leans to."""
+
+    def _predict(
+        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
+    ) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        return th.where(observation[:, POLE_ANGLE] > 0, RIGHT, LEFT)
+
+
+class ReferenceAgent(OnlineAlgorithm):
+    """Acts by a fixed policy; training it changes nothing but its counters.
+
+    Args:
+        policy: name of the policy.
+        env: environment, or its id.
+    """
+
+    hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self.policy_class(self.observation_space, self.action_space)
+
+    def _choose_actions(self) -> NDArray[Any]:
+        assert self._last_obs is not None
+        return self.predict(self._last_obs)[0]
+
+
+class RandomAgent(ReferenceAgent):
+    """Uniformly random actions, whatever is observed."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"RandomPolicy": RandomPolicy}
+
+
+class AngleAgent(ReferenceAgent):
+    """CartPole: push the cart towards the side that the pole leans to."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"AnglePolicy": AnglePolicy}
+
 
 # Actions of shape (m, S), with 1, 2, ... steps left, and the horizon.
 Plan = tuple[NDArray[np.integer[Any]], int]

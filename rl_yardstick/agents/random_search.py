@@ -8,7 +8,7 @@ import sb3_contrib
 from stable_baselines3.common.callbacks import BaseCallback
 from torch.nn.utils import parameters_to_vector
 
-from rl_yardstick.agents.common.callbacks import tell_safe_moment
+from rl_yardstick.agents.common.callbacks import BlockCallback, members
 
 
 class _TrainingStoppedError(Exception):
@@ -32,7 +32,9 @@ class ARS(sb3_contrib.ARS):
     tells_safe_moments = True
 
     def _do_one_update(self, callback: BaseCallback, async_eval: Any) -> None:
-        tell_safe_moment(callback)
+        for member in members(callback):
+            if isinstance(member, BlockCallback):
+                member.at_safe_moment()
         super()._do_one_update(callback, async_eval)
 
     def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:

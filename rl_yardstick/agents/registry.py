@@ -151,10 +151,10 @@ _mabwiser = _family(
 
 
 ALGORITHMS: dict[str, AlgorithmEntry] = {
-    "qlearning": _tabular("one_step:QLearning", "Q-learning on a table"),
-    "sarsa": _tabular("one_step:SARSA", "SARSA on a table"),
-    "expected_sarsa": _tabular("one_step:ExpectedSARSA", "Expected SARSA on a table"),
-    "double_qlearning": _tabular("one_step:DoubleQLearning", "double Q-learning on two tables"),
+    "qlearning": _tabular("n_step:QLearning", "Q-learning on a table"),
+    "sarsa": _tabular("n_step:SARSA", "SARSA on a table"),
+    "expected_sarsa": _tabular("n_step:ExpectedSARSA", "Expected SARSA on a table"),
+    "double_qlearning": _tabular("n_step:DoubleQLearning", "double Q-learning on two tables"),
     "n_step_sarsa": _tabular("n_step:NStepSARSA", "n-step SARSA on a table"),
     "n_step_tree_backup": _tabular("n_step:NStepTreeBackup", "n-step tree backup on a table"),
     "sarsa_lambda": _tabular("n_step:SARSALambda", "SARSA(lambda): traces on a table"),
@@ -237,13 +237,13 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     ),
     "optimal": _planning("Optimal", "planning: the optimum under the time limit"),
     "random": AlgorithmEntry(
-        "rl_yardstick.agents.reference:RandomAgent",
+        "rl_yardstick.agents.planning:RandomAgent",
         "uniformly random actions",
         NETWORK_INPUTS,
         POLICY_GRADIENT_OUTPUTS,
     ),
     "angle": AlgorithmEntry(
-        "rl_yardstick.agents.reference:AngleAgent",
+        "rl_yardstick.agents.planning:AngleAgent",
         "CartPole: push to where the pole leans",
         CONTINUOUS,
         DISCRETE,

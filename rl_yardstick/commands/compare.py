@@ -171,10 +171,10 @@ def held(root: Path) -> Iterator[None]:
 
 def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> Workers:
     """The workers that the flags ask for."""
-    from rl_yardstick.experiments.pool import Workers, available_cores
+    from rl_yardstick.experiments.pool import Workers
 
     if args.cluster is None:
-        return Workers(max(args.jobs, 0) or available_cores(), timeout)
+        return Workers(args.jobs, timeout)
     try:
         from rl_yardstick.experiments.cluster import ClusterWorkers
 

@@ -47,7 +47,7 @@ def main() -> int:
     """Explain an agent."""
     args = build_parser().parse_args()
     from rl_yardstick.commands.terminal import TextConsole, say
-    from rl_yardstick.report.why import as_words, why_lines
+    from rl_yardstick.report.words import as_words, why_lines
 
     console, wanted = TextConsole(), wanted_model(args)
     one = asked(console, wanted)
@@ -138,11 +138,11 @@ def tried_changes(
     from rl_yardstick.commands.compare import Job, do_study, held
     from rl_yardstick.commands.terminal import say
     from rl_yardstick.experiments.plan import StudyRecord, plan, specs_of
-    from rl_yardstick.experiments.pool import Workers, available_cores
+    from rl_yardstick.experiments.pool import Workers
     from rl_yardstick.experiments.results import tried
     from rl_yardstick.experiments.study import intervention_study
     from rl_yardstick.pipeline.run import Stop
-    from rl_yardstick.report.why import tried_lines
+    from rl_yardstick.report.words import tried_lines
 
     spec, run = one.found.spec, one.found.run
     changes = [" ".join(change) for change in args.test if change] or explained.proposals
@@ -150,7 +150,7 @@ def tried_changes(
     study = intervention_study(spec, changes, name)
     root, specs = Path(args.folder) / "explain" / study.name, specs_of(study)
     planned = plan(study, root, specs=specs)
-    workers = Workers(max(args.jobs, 0) or available_cores())
+    workers = Workers(args.jobs)
     with held(root), workers:
         StudyRecord(study, specs).write(root)
         job = Job(root, cli.command_line(), console, Stop().listen(), workers)

@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
-from rl_yardstick.agents.planning import PlanningAgent
-from rl_yardstick.agents.reference import RandomAgent
+from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.diagnosis.proposals import proposals
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.envs.layout import action_names, state_name

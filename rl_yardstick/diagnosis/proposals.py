@@ -17,8 +17,7 @@ import numpy as np
 from scipy.special import bdtr
 
 from rl_yardstick.agents import load_algorithm
-from rl_yardstick.agents.planning import PlanningAgent
-from rl_yardstick.agents.reference import RandomAgent
+from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.envs.known_models import time_limit
 from rl_yardstick.mdp import (
     TransitionModel,

@@ -77,11 +77,6 @@ class Evidence:
         zero, one = self.baseline or 0.0, self.optimum or 0.0
         return {name: np.clip((x - zero) / (one - zero), 0, 1) for name, x in given.items()}
 
-    @property
-    def judged_bounds(self) -> Bounds:
-        """The least and the greatest possible score, or else metric."""
-        return UNIT if self.is_score else self.bounds
-
 
 def evidence_of(results: StudyResults) -> list[Evidence]:
     """Collect the evidence on each environment on which a run has finished."""
@@ -147,7 +142,7 @@ def _verdicts_on(
 ) -> Study:
     """The verdicts on all pairs; ``overall`` has mean scores over all environments by seed."""
     scores: dict[str, Mapping[str, Floats]] = {one.environment: one.scores for one in evidence}
-    bounds = {one.environment: one.judged_bounds for one in evidence}
+    bounds = {one.environment: UNIT if one.is_score else one.bounds for one in evidence}
     for one in evidence:
         if one.is_cost:
             bounds[one.environment] = (-one.bounds[1], -one.bounds[0])
@@ -391,7 +386,8 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
 
     compared = evidence.scores[agent]
     finite = compared[np.isfinite(compared)]
-    judged = mean_over_runs(-compared if evidence.is_cost else compared, evidence.judged_bounds)
+    bounds = UNIT if evidence.is_score else evidence.bounds
+    judged = mean_over_runs(-compared if evidence.is_cost else compared, bounds)
     optimum, baseline, score = evidence.optimum, evidence.baseline, None
     if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
         score = mean_over_runs(np.clip(values("score"), 0, 1), UNIT)

@@ -70,18 +70,17 @@ def arm_regressions(
     """
     centre, scale = contexts.mean(axis=0), contexts.std(axis=0)
     scale[scale == 0] = 1
-
-    def inputs(rows: Floats) -> Floats:
-        return np.column_stack([np.ones(len(rows)), (rows - centre) / scale])
-
-    level, known = rewards.mean(), inputs(contexts)
+    known, inputs = (
+        np.column_stack([np.ones(len(rows)), (rows - centre) / scale]) for rows in (contexts, asked)
+    )
+    level = rewards.mean()
     prior = RIDGE * np.eye(known.shape[1])
     coefficients = np.zeros((n_arms, len(prior)))
     for arm in range(n_arms):
         rows = known[arms == arm]
         moments = rows.T @ (rewards[arms == arm] - level)
         coefficients[arm] = linalg.cho_solve(linalg.cho_factor(rows.T @ rows + prior), moments)
-    return np.asarray(level + inputs(asked) @ coefficients.T)
+    return np.asarray(level + inputs @ coefficients.T)
 
 
 def cross_fit(

@@ -334,23 +334,21 @@ def plan_of_looks(study: StudySpec, root: Path, most: int | None) -> tuple[int, 
     if before is None or not before.looks:
         return look_sizes(study.n_seeds, max(most or MOST_SEEDS, study.n_seeds))
     looks = look_sizes(study.n_seeds, most or before.looks[-1])
-    there, here = _fixed(before.study, before.looks), _fixed(study, looks)
+    there, here = (
+        {
+            "looks": [*sizes],
+            "agents": sorted(agent.label for agent in one.agents),
+            "environments": sorted(environment.label for environment in one.environments),
+            **{name: getattr(one, name) for name in ("metric", "margin", "first_seed", "against")},
+        }
+        for one, sizes in ((before.study, before.looks), (study, looks))
+    )
     if changed := [f"{k} {there[k]}, now {here[k]}" for k in there if there[k] != here[k]]:
         raise UserError(
             f"{root}: the looks were planned before the first of them and cannot change "
             f"({'; '.join(changed)}): --name NAME makes another study"
         )
     return looks
-
-
-def _fixed(study: StudySpec, looks: tuple[int, ...]) -> dict[str, object]:
-    """What must not change from one look to the next."""
-    return {
-        "looks": [*looks],
-        "agents": sorted(agent.label for agent in study.agents),
-        "environments": sorted(environment.label for environment in study.environments),
-        **{name: getattr(study, name) for name in ("metric", "margin", "first_seed", "against")},
-    }
 
 
 def look_sizes(first: int, most: int) -> tuple[int, ...]:

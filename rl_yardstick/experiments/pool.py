@@ -114,6 +114,9 @@ class Workers:
     """
 
     def __init__(self, n_at_once: int, timeout: float | None = None) -> None:
+        if n_at_once < 1:  # as many as there are cores that this process may use
+            has_affinity = hasattr(os, "sched_getaffinity")
+            n_at_once = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
         self.n_at_once, self.timeout = n_at_once, timeout
         self.words = f"{n_at_once} at once"
         self._pool: ProcessPool | None = None
@@ -171,11 +174,6 @@ def do_aside(function: Callable[..., Any], *args: Any) -> Any:
     """Call a function in another process, so that this one need not import the libraries."""
     with process_pool(1) as pool:
         return pool.schedule(function, args=args).result()
-
-
-def available_cores() -> int:
-    """The number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 # --- doing runs -----------------------------------------------------------------------------------

@@ -277,16 +277,14 @@ class _Quick(_Part):
     budget: Annotated[_Float, Field(gt=0, le=1)] | None = None
 
 
-def _count(value: Any) -> Any:
-    return value if isinstance(value, dict) else {"count": value}
-
-
 class _File(_Part):
     title: str = ""
     description: str = ""
     agents: Annotated[dict[str, _Agent], BeforeValidator(_by_label)] = Field({})
     environments: Annotated[dict[str, _Environment], BeforeValidator(_by_label)] = Field({})
-    seeds: Annotated[_Seeds, BeforeValidator(_count)] = _Seeds()
+    seeds: Annotated[
+        _Seeds, BeforeValidator(lambda n: n if isinstance(n, dict) else {"count": n})
+    ] = _Seeds()
     settings: dict[str, Any] = {}
     sweep: _Sweep = {}
     quick: _Quick = _Quick()
@@ -344,11 +342,21 @@ def read_study(path: Path) -> StudySpec:
     except ValidationError as error:
         raise _in_one_line(path, error) from None
     given = {key: value for key in BUDGETS if (value := getattr(file, key)) is not None}
+    agents = tuple(_agents(path, file))
+    shared, environments = layered(file.settings, given), []
+    for label, entry in file.environments.items():
+        env_id = label if entry.id is None else entry.id
+        try:
+            check_env_id(env_id)
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from error
+        own = {**(AS_IT_COMES if entry.as_it_comes else {}), **entry.settings}
+        environments.append(EnvironmentSpec(label, env_id, layered(shared, own)))
     return StudySpec(
         name=path.stem,
         title=file.title or path.stem,
-        agents=tuple(_agents(path, file)),
-        environments=tuple(_environments(path, file, layered(file.settings, given))),
+        agents=agents,
+        environments=tuple(environments),
         n_seeds=file.seeds.count,
         first_seed=file.seeds.first,
         quick=QuickSpec(file.quick.seeds, file.quick.budget),
@@ -397,17 +405,6 @@ def _agents(path: Path, file: _File) -> list[AgentSpec]:
     if len({agent.group for agent in agents}) == 1 and agents[0].swept:
         agents = [replace(a, label=a.label.removeprefix(f"{a.group} with ")) for a in agents]
     return agents
-
-
-def _environments(path: Path, file: _File, shared: Mapping[str, Any]) -> Iterator[EnvironmentSpec]:
-    for label, entry in file.environments.items():
-        env_id = label if entry.id is None else entry.id
-        try:
-            check_env_id(env_id)
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from error
-        as_it_comes = AS_IT_COMES if entry.as_it_comes else {}
-        yield EnvironmentSpec(label, env_id, layered(shared, {**as_it_comes, **entry.settings}))
 
 
 # --- changes of the settings of an agent, over four seeds, as evidence for causes -----------------

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
         state_values,
         state_visitation,
     )
-    from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
     from rl_yardstick.mdp.hardness import Hardness, hardness_of
-    from rl_yardstick.mdp.large_maps import optimum_far_from_limit
+    from rl_yardstick.mdp.large_maps import finite_horizon_optimum, optimum_far_from_limit
     from rl_yardstick.mdp.planning import Plan, policy_iteration, value_iteration
 
 __all__ = [

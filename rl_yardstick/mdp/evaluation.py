@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl_yardstick.machine_code.compiling import called, compiled
-from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
 from rl_yardstick.mdp.graph import PolicyChain, reachable_states
-from rl_yardstick.mdp.large_maps import moments_by_spreading, walked
+from rl_yardstick.mdp.large_maps import finite_horizon_optimum, moments_by_spreading, walked
 from rl_yardstick.mdp.planning import action_value
 from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
@@ -316,7 +315,7 @@ class LimitedEpisodes:
         model, states = self.model, self._visited()
         moments = self.along_ways(states, discount, ends_well)
         is_large = len(states) * self.horizon > MOST_BACKWARDS
-        if moments is None and is_large and self._is_stationary():
+        if moments is None and is_large and not np.issubdtype(self.policy.dtype, np.integer):
             rows = model.prob, model.next_state, model.terminated, model.reward, ends_well
             start = self.policy.astype(np.float64), model.initial
             found = moments_by_spreading(rows, *start, self.horizon, discount, floor)
@@ -355,15 +354,12 @@ class LimitedEpisodes:
         place[states] = np.arange(len(states))
         return place
 
-    def _is_stationary(self) -> bool:
-        return not np.issubdtype(self.policy.dtype, np.integer)
-
     def along_ways(self, states: Ints, discount: float, ends_well: Bools) -> Floats | None:
         """The moments, if each of the n states has one outcome; None if a state has more.
 
         The states must be closed under the policy; shape (n, 5) as `moments_under_limit`.
         """
-        if not self._is_stationary():
+        if np.issubdtype(self.policy.dtype, np.integer):
             return None
         action = self.policy[states].argmax(axis=1)
         at = states, action, self.model.prob[states, action].argmax(axis=1)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
+from functools import partial
 from itertools import count, cycle
 from typing import NamedTuple
 
@@ -107,10 +108,7 @@ def best_memoryless(
         return -value, -(shares * (by_group - mean)).ravel()
 
     seen = np.unique(groups[states])
-
-    def returns(choices: Ints) -> Floats:
-        return _firm_returns(model.dynamics, model.initial, states, groups, choices, horizon)
-
+    returns = partial(_firm_returns, model.dynamics, model.initial, states, groups, horizon)
     n_firm, per_firm = n_actions ** len(seen), len(states) * model.n_outcomes * horizon
     is_firm_known = n_firm <= MOST_FIRM and n_firm * per_firm <= MOST_WORK
     firm, ends = -np.inf, []
@@ -278,7 +276,7 @@ def _return_in_box(
 
 @compiled
 def _firm_returns(
-    model: Dynamics, initial: Floats, states: Ints, groups: Ints, choices: Ints, horizon: int
+    model: Dynamics, initial: Floats, states: Ints, groups: Ints, horizon: int, choices: Ints
 ) -> Floats:
     """The returns (P,) of deterministic policies, as actions by observation (P, G)."""
     prob = model[0]

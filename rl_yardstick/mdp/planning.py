@@ -1,7 +1,7 @@
 """The best policy of a finite Markov decision process, and its values.
 
 Without a time limit some best policy is stationary; for planning under a time limit, see
-``mdp.finite_horizon``.
+``mdp.large_maps``.
 
 Without discount, the sum of rewards until the episode ends is a stochastic shortest path problem
 (Bertsekas and Tsitsiklis, An Analysis of Stochastic Shortest Path Problems, 1991). It has a finite
@@ -377,9 +377,6 @@ class PlanningProblem:
         diagonal = 1.0 - np.where(stays, weight, 0.0).sum(axis=1)
         nothing = np.zeros(n)
 
-        def product(vector: Floats) -> Floats:
-            return -residuals(weight, following, nothing, vector)
-
         def sweep(right: Floats) -> Floats:
             found = np.zeros(n)
             evaluate(weight, following, right, diagonal, found)
@@ -387,7 +384,9 @@ class PlanningProblem:
 
         missing = residuals(weight, following, reward, values[order])
         change, _ = bicgstab(
-            LinearOperator((n, n), product, dtype=np.float64),
+            LinearOperator(
+                (n, n), lambda v: -residuals(weight, following, nothing, v), dtype=np.float64
+            ),
             missing,
             rtol=ACCURACY_OF_SOLUTIONS,
             maxiter=MOST_KRYLOV_STEPS,

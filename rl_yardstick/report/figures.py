@@ -405,7 +405,12 @@ def draw_learning_curves(places: Sequence[Axes], one: EnvironmentSeries, marks: 
         found = curves[kind]
         # Before the lines, because the limits depend on the scale.
         words = _set_scale(axes, scales[kind])
-        _draw_curves(axes, found.by_axis[by], marks)
+        for place, (agent, curve) in enumerate(found.by_axis[by].items()):
+            marker = "o" if len(curve.x) == 1 else ""  # a single point draws no line
+            style = line_style(marks[agent])
+            axes.plot(curve.x, curve.y, label=agent, linewidth=1.5, marker=marker, **style)
+            if place < MOST_BANDS:
+                fill_band(axes, curve, marks[agent])
         for agent in filter(found.by_axis[by].__contains__, found.on_variant):
             # Circles mark the curve of a variant without colour.
             curve, colour = found.by_axis[by][agent], COLOURS[marks[agent].colour]
@@ -424,16 +429,6 @@ def draw_learning_curves(places: Sequence[Axes], one: EnvironmentSeries, marks: 
     if on_variant:  # the legend's entry for the circles
         places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
     shared_legend(*places, band=band_words(len(environment.agents)))
-
-
-def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
-    """Curves, the first ones with their intervals."""
-    for place, (agent, curve) in enumerate(curves.items()):
-        marker = "o" if len(curve.x) == 1 else ""  # a single point draws no line
-        style = line_style(marks[agent])
-        axes.plot(curve.x, curve.y, label=agent, linewidth=1.5, marker=marker, **style)
-        if place < MOST_BANDS:
-            fill_band(axes, curve, marks[agent])
 
 
 MOST_POWERS = 12  # powers of ten on an axis

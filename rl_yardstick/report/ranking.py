@@ -96,10 +96,6 @@ def filled(columns: Sequence[Column], rows: Sequence[Row]) -> list[tuple[Column,
     return [(column, [cell or dash for cell in cells]) for column, cells in found if any(cells)]
 
 
-def _median(row: Row) -> Cell:
-    return estimate_cell(row.agent.metric.median)
-
-
 def _score(row: Row) -> Cell | None:
     if row.agent.score is None:
         return None
@@ -147,10 +143,6 @@ def _stays_from(row: Row) -> Cell | None:
     return replace(cell, aside=aside)
 
 
-def _episodes(row: Row) -> Cell | None:
-    return threshold_cell(row.agent.episodes_to_stay)
-
-
 def _seconds(row: Row) -> Cell | None:
     seconds = row.agent.seconds
     if math.isnan(seconds.point):
@@ -182,14 +174,21 @@ def _by_pulls(cell: Callable[[PullStatistics], Cell]) -> Callable[[Row], Cell | 
 COLUMNS = (
     Column(lambda row: estimate_cell(row.agent.metric.mean), "Mean", "over seeds", None, "mean"),
     Column(lambda row: number_cell(row.agent.metric.iqm), "IQM", "middle half"),
-    Column(_median, "Median", "over seeds", None, "median"),
+    Column(
+        lambda row: estimate_cell(row.agent.metric.median), "Median", "over seeds", None, "median"
+    ),
     Column(_score, "Score", "1 is optimal", "descending", "score"),
     Column(_failed, "Failed", "runs below {failed}", "ascending", "failed"),
     Column(_gap, "Gap", "to the optimum", "ascending"),
     Column(_training, terminal="training"),
     Column(_success, "Success", "in the end", "descending"),
     Column(_stays_from, "Stays from", "step, at {threshold}", "ascending", "stays from"),
-    Column(_episodes, "Episodes", "to stay at {threshold}", "ascending"),
+    Column(
+        lambda row: threshold_cell(row.agent.episodes_to_stay),
+        "Episodes",
+        "to stay at {threshold}",
+        "ascending",
+    ),
     Column(_seconds, "CPU time", "seconds of training", "ascending", "CPU time"),
     Column(_runs, "Runs", "finished", "descending"),
 )
@@ -209,14 +208,6 @@ def _other_return(returns: Estimate | None, words: str) -> Cell:
     return replace(cell, note="; ".join(filter(None, (cell.note, words))))
 
 
-def _greedy(row: Row) -> Cell:
-    return estimate_cell(row.agent.final)
-
-
-def _stochastic(row: Row) -> Cell:
-    return _other_return(row.agent.stochastic, row.agent.acts_by)
-
-
 def _discounted(row: Row) -> Cell | None:
     discount, optimum = row.agent.discount, row.agent.discounted_optimum
     if discount is None:  # an agent that has none
@@ -227,8 +218,18 @@ def _discounted(row: Row) -> Cell | None:
 
 # On the page, folded below the ranking.
 OTHER_RETURNS = (
-    Column(_greedy, "Greedy", "the final policy's return", "descending"),
-    Column(_stochastic, "Stochastic", "as it acts in training", "descending"),
+    Column(
+        lambda row: estimate_cell(row.agent.final),
+        "Greedy",
+        "the final policy's return",
+        "descending",
+    ),
+    Column(
+        lambda row: _other_return(row.agent.stochastic, row.agent.acts_by),
+        "Stochastic",
+        "as it acts in training",
+        "descending",
+    ),
     Column(_discounted, "Discounted", "greedy, under its own discount", "descending"),
 )
 

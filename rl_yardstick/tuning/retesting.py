@@ -249,12 +249,11 @@ def entry_text(tuning: TuningSpec, entry: Mapping[str, Any], comment: str = "") 
     used = dict.fromkeys([*before, tuning.study.seeds])
     seeds = [{"first": each.start, "count": len(each)} for each in used]
     lines = textwrap.wrap(comment, 100, initial_indent="# ", subsequent_indent="# ")
-    parts = _yaml({TUNED_ON: {env_id: seeds}}), "\n".join(["", *lines, ""]), _yaml({env_id: entry})
-    return "".join(parts)
-
-
-def _yaml(data: Mapping[str, Any]) -> str:
-    return yaml.safe_dump(plain(data), sort_keys=False, allow_unicode=True)
+    tuned_on, found = (
+        yaml.safe_dump(plain(data), sort_keys=False, allow_unicode=True)
+        for data in ({TUNED_ON: {env_id: seeds}}, {env_id: entry})
+    )
+    return tuned_on + "\n".join(["", *lines, ""]) + found
 
 
 def write_winner(search: Search, outcome: Outcome) -> Path | None:

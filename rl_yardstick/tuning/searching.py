@@ -30,7 +30,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
 from rl_yardstick.agents import ALGORITHMS
-from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.plan import PlannedRun, plan
 from rl_yardstick.experiments.results import read_run
 from rl_yardstick.pipeline.errors import UserError, one_line, shown
 from rl_yardstick.pipeline.files import plain
@@ -41,7 +41,6 @@ from rl_yardstick.tuning.suggesting import (
     name_of,
     planned_runs,
     shipped_entry,
-    shipped_run,
 )
 from rl_yardstick.tuning.tuning_spec import AUTO, STEPS, TuningSpec
 
@@ -355,7 +354,7 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
     Raises:
         UserError: if the search cannot be done, or the folder has another one.
     """
-    run, agent = shipped_run(tuning, root), tuning.agent
+    run, agent = plan(replace(tuning.study, n_seeds=1), root)[0], tuning.agent
     if tuning.figure == AUTO:
         is_bandit = ALGORITHMS[agent.algo].for_bandits
         tuning = replace(tuning, figure="regret" if is_bandit else "score")

@@ -144,11 +144,6 @@ def name_of(entry: Mapping[str, Any]) -> str:
     return f"settings-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
-def shipped_run(tuning: TuningSpec, root: Path) -> PlannedRun:
-    """A planned run of the agent with the initial settings."""
-    return plan(replace(tuning.study, n_seeds=1), root)[0]
-
-
 def shipped_entry(spec: TrainSpec) -> dict[str, Any]:
     """The entry of a training in the form of files, without what follows from its other values."""
     entry = spec.hyperparams

@@ -22,8 +22,8 @@ from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.agents.common.schedules import ExponentialSchedule, library_schedule
 from rl_yardstick.agents.library import DeepQLearning, DoubleDQN, double_q_values
+from rl_yardstick.agents.planning import AngleAgent, RandomAgent
 from rl_yardstick.agents.random_search import ARS
-from rl_yardstick.agents.reference import AngleAgent, RandomAgent
 from rl_yardstick.envs.wrappers import ActionMasks
 from tests.agents.trainings import Every, Plain
 

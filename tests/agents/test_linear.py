@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
-from rl_yardstick.agents.linear.tiles import make_tiles, tiles_of_all
+from rl_yardstick.agents.linear.algorithm import make_tiles, tiles_of_all
 from tests.agents.hand_fed import Told
 
 UNIT = spaces.Box(0.0, 1.0, (2,))

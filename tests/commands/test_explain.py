@@ -128,7 +128,7 @@ def test_a_script_of_ones_own(type_command, tmp_path):
 
 
 def test_a_class_of_ones_own(type_command, tmp_path, monkeypatch):
-    text = "from rl_yardstick.agents.tabular.one_step import QLearning\n\nMine = QLearning\n"
+    text = "from rl_yardstick.agents.tabular.n_step import QLearning\n\nMine = QLearning\n"
     (tmp_path / "my_audited_agents.py").write_text(text)
     few = (target_probes.probe_ends, target_probes.probe_discount)
     monkeypatch.setattr(audit, "__defaults__", (few,))

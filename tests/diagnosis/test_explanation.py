@@ -10,7 +10,7 @@ from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.mdp import policy_iteration
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.training import make_agent
-from rl_yardstick.report.why import why_lines
+from rl_yardstick.report.words import why_lines
 from tests.pipeline.short_runs import spec_of
 
 LAKE = {"env_kwargs": {"is_slippery": False, "max_episode_steps": 30}}

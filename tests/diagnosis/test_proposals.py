@@ -9,7 +9,7 @@ from rl_yardstick.experiments.study import AS_IT_IS, SHIPPED, intervention_study
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.settings import override, parse_assignments, read_entry, read_spec
 from rl_yardstick.pipeline.training import make_agent
-from rl_yardstick.report.why import tried_lines
+from rl_yardstick.report.words import tried_lines
 from tests.pipeline.short_runs import LAKE, WAREHOUSE, spec_of
 
 TAXI, CLIFF = "Taxi-v4", "CliffWalking-v1"

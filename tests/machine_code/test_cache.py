@@ -10,7 +10,7 @@ import pytest
 from numba.core import event
 
 from rl_yardstick.machine_code import WorkTime
-from rl_yardstick.machine_code import cache as code_cache
+from rl_yardstick.machine_code import compiling as code_cache
 from rl_yardstick.machine_code.compiling import called, compile_timer, compiled, inlined, kernel
 
 # A function, and another of another file that it is compiled into.
@@ -33,7 +33,7 @@ def run_small(x):
 SMALL = """
 import logging
 names = []
-logging.getLogger("rl_yardstick.machine_code.cache").setLevel(logging.INFO)
+logging.getLogger("rl_yardstick.machine_code.compiling").setLevel(logging.INFO)
 logging.Handler.handle = lambda handler, record: names.append(record.getMessage())
 logging.getLogger().addHandler(logging.Handler())
 from rl_yardstick.mdp.small_loop import run_small
@@ -72,7 +72,7 @@ def test_a_changed_rule_in_another_file_is_what_runs(checkout):
         assert run(checkout, SMALL) == expected
     # A process that began with other sources caches nothing.
     rule.write_text(RULE.replace("3.0", "2.0"))
-    began = "from rl_yardstick import mdp\nfrom rl_yardstick.machine_code.cache import folder\n"
+    began = "from rl_yardstick import mdp\nfrom rl_yardstick.machine_code.compiling import folder\n"
     edited = f"folder()\nopen({str(rule)!r}, 'a').write('# more')\n{SMALL}"
     counted = "print(len(list(folder().rglob('*.nb[ic]'))))"
     assert run(checkout, began + edited + counted) == ["9", "1", "0"]
@@ -80,7 +80,7 @@ def test_a_changed_rule_in_another_file_is_what_runs(checkout):
 
 OWN_RULE = """
 from rl_yardstick.machine_code.compiling import inlined
-from rl_yardstick.agents.tabular.one_step import QLearning
+from rl_yardstick.agents.tabular.n_step import QLearning
 WORTH = {worth}
 
 @inlined

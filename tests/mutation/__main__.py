@@ -155,7 +155,7 @@ class Copy:
 
     def _keep_machine_code(self, code: Path, fresh: bool) -> None:
         """Give what was compiled before the error the error's digest, if it is not about that."""
-        from rl_yardstick.machine_code.cache import digest
+        from rl_yardstick.machine_code.compiling import digest
 
         digests = (self.place / "kept" / "yardstick").iterdir()
         before = max(digests, key=lambda p: p.stat().st_mtime)

@@ -14,8 +14,7 @@ from rl_yardstick.pipeline.components import constructor_arguments
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.settings import entry_names, read_entry, read_spec, read_yaml
 from rl_yardstick.tuning import search_spaces
-from rl_yardstick.tuning.dimensions import same
-from rl_yardstick.tuning.search_spaces import corners, read_search_space
+from rl_yardstick.tuning.search_spaces import corners, read_search_space, same
 from rl_yardstick.tuning.searching import open_search
 from rl_yardstick.tuning.suggesting import Suggestions, shipped_entry
 from rl_yardstick.tuning.tuning_spec import TuningSpec

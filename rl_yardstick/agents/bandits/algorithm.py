@@ -218,14 +218,11 @@ class BanditAlgorithm(LearningAlgorithm):
         assert self.env is not None
         self._masks = present_masks(self.env, obs)
         actions, self._probabilities = self._choose(contexts, self.rng, self._masks)
-        if len(self._policy_masks):
-            self._policy_masks[obs] = self._masks
+        # The last masks seen in each context; no rows if contexts are vectors.
+        kept = cast(ArmPolicy, self.policy).masks
+        if len(kept):
+            kept[obs] = self._masks
         return actions
-
-    @property
-    def _policy_masks(self) -> Bools:
-        """The last masks seen in each context; no rows if contexts are vectors."""
-        return cast(ArmPolicy, self.policy).masks
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Bools | None = None) -> None:
         super()._update_info_buffer(infos, dones)
@@ -284,7 +281,7 @@ class BanditAlgorithm(LearningAlgorithm):
 
     def _masks_at(self, obs: NDArray[Any], n: int, told: Any) -> Bools:
         """The given or kept masks at ``n`` observations, shape (n, arms)."""
-        if told is None and not len(self._policy_masks):
+        if told is None and not len(cast(ArmPolicy, self.policy).masks):
             raise ValueError("mask_actions: predict needs action_masks where contexts are vectors")
         if told is None:
             return cast(ArmPolicy, self.policy).kept_masks(obs.reshape(-1).astype(np.int64))

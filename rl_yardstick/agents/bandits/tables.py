@@ -61,11 +61,6 @@ class BanditPolicy(ArmPolicy):
         """The buffers as arrays that share their memory."""
         return ScoreTables(self.scores.numpy(), self.sums.numpy(), self.counts.numpy())
 
-    @property
-    def mean_rewards(self) -> Floats:
-        """Average reward of each arm, nan where there is none, shape (C, A)."""
-        return mean_rewards(self.sums.numpy(), self.counts.numpy())
-
     def judged(self, observations: NDArray[Any]) -> Floats:
         rows = observations.astype(np.int64).reshape(-1)
         scores: Floats = self.scores.numpy()[rows % len(self.scores)]

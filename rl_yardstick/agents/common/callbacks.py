@@ -137,16 +137,12 @@ def _every_n_timesteps(callback: Any) -> Horizon:
     return Horizon(calls=max(-(-steps // n_envs), 1))
 
 
-def _max_episodes(callback: Any) -> Horizon:
-    return Horizon(episodes=callback._total_max_episodes - callback.n_episodes)
-
-
 _LIBRARY_HORIZONS: dict[type[BaseCallback], Callable[[Any], Horizon]] = {
     EvalCallback: lambda c: Horizon(calls_until_multiple(c.n_calls, c.eval_freq)),
     CheckpointCallback: lambda c: Horizon(calls_until_multiple(c.n_calls, c.save_freq)),
     EveryNTimesteps: _every_n_timesteps,
     LogEveryNTimesteps: _every_n_timesteps,
-    StopTrainingOnMaxEpisodes: _max_episodes,
+    StopTrainingOnMaxEpisodes: lambda c: Horizon(episodes=c._total_max_episodes - c.n_episodes),
     ProgressBarCallback: lambda _: Horizon(),
 }
 
@@ -198,13 +194,6 @@ def heeds_rollouts(callback: BaseCallback) -> bool:
 def wants_position(callback: BaseCallback) -> bool:
     """Whether `BlockCallback.wants_position` holds for one of the callbacks."""
     return any(isinstance(m, BlockCallback) and m.wants_position() for m in members(callback))
-
-
-def tell_safe_moment(callback: BaseCallback) -> None:
-    """Call `BlockCallback.at_safe_moment` of each of the callbacks."""
-    for member in members(callback):
-        if isinstance(member, BlockCallback):
-            member.at_safe_moment()
 
 
 def pass_over(callback: BaseCallback, n_calls: int, n_episodes: int) -> None:

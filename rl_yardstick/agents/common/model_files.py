@@ -82,22 +82,18 @@ def encode(value: Any) -> Any:
     if type(value) in _AS_THEY_ARE:
         return value
     if type(value) is dict:  # fast path for Monitor's hundred episode records
-        return {TYPE: "dict", "pairs": [_encode_all(pair) for pair in value.items()]}
+        return {TYPE: "dict", "pairs": [[*map(encode, pair)] for pair in value.items()]}
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list):
-        return _encode_all(value)
+        return [*map(encode, value)]
     name = type(value).__name__
     codec = CODECS.get(name)
     if codec is None or type(value) is not codec.cls:
         raise UnknownTypeError(f"cannot be written as JSON: {type(value).__module__}.{name}")
     return {TYPE: name, **{key: encode(read(value)) for key, read in codec.fields.items()}}
-
-
-def _encode_all(values: Iterable[Any]) -> list[Any]:
-    return [value if type(value) in _AS_THEY_ARE else encode(value) for value in values]
 
 
 def decode(data: Any) -> Any:
@@ -136,10 +132,6 @@ def _space(cls: type, make: Callable[..., Any], **fields: Callable[[Any], Any]) 
     return Codec(cls, {**fields, "rng": attrgetter("_np_random")}, build)
 
 
-def _pairs(mapping: Mapping[Any, Any]) -> list[list[Any]]:
-    return [list(pair) for pair in mapping.items()]
-
-
 def _generator_state(generator: np.random.Generator) -> Mapping[str, Any]:
     # `default_rng` makes this kind, and `_generator` rebuilds only this kind.
     if not isinstance(generator.bit_generator, np.random.PCG64):
@@ -172,19 +164,6 @@ def _discrete(n: int, start: int) -> spaces.Discrete:
     return spaces.Discrete(n, start=start)
 
 
-def _multi_discrete(nvec: np.ndarray[Any, Any], start: np.ndarray[Any, Any]) -> Any:
-    return spaces.MultiDiscrete(nvec, dtype=nvec.dtype.type, start=start)
-
-
-def _box(low: np.ndarray[Any, Any], high: np.ndarray[Any, Any]) -> spaces.Box:
-    return spaces.Box(low, high, dtype=low.dtype.type)
-
-
-def _dict_space(pairs: list[list[Any]]) -> spaces.Dict:
-    # Pairs, because a Dict space sorts the keys of a plain mapping.
-    return spaces.Dict([(key, space) for key, space in pairs])
-
-
 _system_info = cache(get_system_info)
 _RANGE = _attributes("start", "end", "end_fraction")
 _ARRAY: dict[str, Callable[[Any], Any]] = {
@@ -193,7 +172,7 @@ _ARRAY: dict[str, Callable[[Any], Any]] = {
     "values": lambda array: array.ravel().tolist(),
 }
 _CODEC_LIST = [
-    Codec(dict, {"pairs": _pairs}, dict),
+    Codec(dict, {"pairs": lambda mapping: [*map(list, mapping.items())]}, dict),
     Codec(tuple, {"items": list}, tuple),
     Codec(deque, {"iterable": list, "maxlen": attrgetter("maxlen")}, deque),
     Codec(np.ndarray, _ARRAY, _array),
@@ -203,11 +182,24 @@ _CODEC_LIST = [
     Codec(ExponentialSchedule, _RANGE, ExponentialSchedule),
     Codec(FloatSchedule, _attributes("value_schedule"), FloatSchedule),
     _space(spaces.Discrete, _discrete, **_attributes("n", "start")),
-    _space(spaces.MultiDiscrete, _multi_discrete, **_attributes("nvec", "start")),
+    _space(
+        spaces.MultiDiscrete,
+        lambda nvec, start: spaces.MultiDiscrete(nvec, dtype=nvec.dtype.type, start=start),
+        **_attributes("nvec", "start"),
+    ),
     _space(spaces.MultiBinary, spaces.MultiBinary, **_attributes("n")),
-    _space(spaces.Box, _box, **_attributes("low", "high")),
+    _space(
+        spaces.Box,
+        lambda low, high: spaces.Box(low, high, dtype=low.dtype.type),
+        **_attributes("low", "high"),
+    ),
     _space(spaces.Tuple, spaces.Tuple, spaces=lambda space: list(space.spaces)),
-    _space(spaces.Dict, _dict_space, pairs=lambda space: _pairs(space.spaces)),
+    # Pairs, because a Dict space sorts the keys of a plain mapping.
+    _space(
+        spaces.Dict,
+        lambda pairs: spaces.Dict([(key, space) for key, space in pairs]),
+        pairs=lambda space: [*map(list, space.spaces.items())],
+    ),
 ]
 CODECS = {codec.cls.__name__: codec for codec in _CODEC_LIST}
 
@@ -240,28 +232,26 @@ class JsonAlgorithm(BaseAlgorithm):
         left_out -= set(include or ())
         data: dict[str, Any] = {"format": FORMAT_VERSION, "algorithm": type(self).__name__}
         for name, value in self.__dict__.items():
-            if name not in left_out:
-                data[name] = self._encode_attribute(name, value)
+            if name in left_out:
+                continue
+            try:
+                data[name] = encode(value)
+            except UnknownTypeError:
+                if not callable(value):
+                    raise
+                # Losing the learnt tables would be worse than losing the shape of a schedule.
+                present = float(value(self._current_progress_remaining))
+                warnings.warn(
+                    f"{name} is a Python function, which a model file cannot hold: "
+                    f"its present value {present} is saved instead",
+                    stacklevel=2,
+                )
+                data[name] = present
         content = _zipped(data, self.get_parameters())
         file = open_path(path, "w", verbose=0, suffix="zip")
         file.write(content)
         if isinstance(path, str | Path):
             file.close()
-
-    def _encode_attribute(self, name: str, value: Any) -> Any:
-        try:
-            return encode(value)
-        except UnknownTypeError:
-            if not callable(value):
-                raise
-            # Losing the learnt tables would be worse than losing the shape of a schedule.
-            present = float(value(self._current_progress_remaining))
-            warnings.warn(
-                f"{name} is a Python function, which a model file cannot hold: "
-                f"its present value {present} is saved instead",
-                stacklevel=3,
-            )
-            return present
 
     @classmethod
     def load(

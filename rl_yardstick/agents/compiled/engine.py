@@ -347,8 +347,11 @@ def play_episodes(
         np.zeros(STEPS_AT_ONCE * n_envs, dtype=EPISODE), np.empty((STEPS_AT_ONCE, n_envs))
     )
     ended: Any = np.zeros(0, dtype=EPISODE)
-    while n_missing := _n_missing(ended["env"], wanted):
+    while True:
         # At least this many more episodes must end.
+        n_ended = np.bincount(ended["env"], minlength=n_envs)
+        if (n_missing := int((wanted - n_ended).clip(0).sum())) == 0:
+            break
         limits = STEPS_AT_ONCE, n_missing, COMPENSATED_SUM
         n_steps = run_block(world, player, states.records, handles, progress[0], log, *limits)
         learn_from_last_step(player, states.records, progress[0])
@@ -361,11 +364,6 @@ def play_episodes(
     record_in_monitors(states.monitors, Episodes.of(ended), n_done)
     states.write()
     return Episodes.of(ended[_are_first(ended["env"], wanted)])
-
-
-def _n_missing(envs: Ints, wanted: Ints) -> int:
-    """The number of wanted episodes that have not ended yet."""
-    return int((wanted - np.bincount(envs, minlength=len(wanted))).clip(0).sum())
 
 
 def _are_first(envs: Ints, wanted: Ints) -> Bools:

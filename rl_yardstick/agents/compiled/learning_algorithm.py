@@ -23,7 +23,7 @@ from rl_yardstick.agents.common.settings import (
     TieBreaking,
     check_settings,
 )
-from rl_yardstick.agents.compiled.loop import check_functions, settings_dtype
+from rl_yardstick.agents.compiled.loop import settings_dtype
 from rl_yardstick.agents.compiled.worlds import PROGRESS, NotCompilable
 
 # One for training, and some for exploring with another generator or number of observations.
@@ -85,7 +85,6 @@ class LearningAlgorithm(OnlineAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        check_functions(cls)
         above = [vars(base).get("parameters", {}) for base in reversed(cls.__mro__)]
         fields = {name: kind for parameters in above for name, kind in parameters.items()}
         cls.settings_type = settings_dtype(cls, fields)

@@ -12,11 +12,11 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from rl_yardstick.agents.common.schedules import schedule_value
-from rl_yardstick.machine_code.cache import RULE_PREFIX
 from rl_yardstick.machine_code.compiling import (
     INLINED_OPTIONS,
     IS_INTERPRETED,
     PART_OPTIONS,
+    RULE_PREFIX,
     PartCompiler,
     inlined,
     kernel,
@@ -79,18 +79,18 @@ def _class_of(argument: Any) -> type | None:
     return chosen
 
 
-def check_functions(algorithm: type) -> None:
-    """Check that all functions of an algorithm that the loop calls are compiled."""
-    for name in _NAMES & vars(algorithm).keys():
-        if not hasattr(vars(algorithm)[name], "py_func"):
+def settings_dtype(algorithm: type, fields: Mapping[str, Any]) -> np.dtype[np.void]:
+    """The type of the record that holds an algorithm's settings.
+
+    Raises:
+        TypeError: if a function of the algorithm that the loop calls is not compiled.
+    """
+    for function in _NAMES & vars(algorithm).keys():
+        if not hasattr(vars(algorithm)[function], "py_func"):
             raise TypeError(
-                f"{algorithm.__name__}.{name} is called by compiled code: put @inlined of "
+                f"{algorithm.__name__}.{function} is called by compiled code: put @inlined of "
                 "rl_yardstick.machine_code.compiling on the function"
             )
-
-
-def settings_dtype(algorithm: type, fields: Mapping[str, Any]) -> np.dtype[np.void]:
-    """The type of the record that holds an algorithm's settings."""
     name = f"{RULE_PREFIX}{algorithm.__module__} {algorithm.__qualname__}"
     _DEFINITIONS[name] += 1
     if _DEFINITIONS[name] > 1:

@@ -19,8 +19,14 @@ from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
-from rl_yardstick.agents.linear.algorithm import TileAlgorithm
-from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, choose, look, move_sum, sum_of
+from rl_yardstick.agents.linear.algorithm import (
+    LinearAgent,
+    TileAlgorithm,
+    add_up,
+    choose,
+    look,
+    sum_of,
+)
 from rl_yardstick.machine_code.compiling import called
 from rl_yardstick.mdp.transition_model import Floats
 
@@ -65,7 +71,8 @@ def semi_gradient_step(agent: LinearAgent, env: Any, progress: Any) -> float:
     look(agent, env, BEFORE, room.tiles)
     td_error = target - sum_of(weights, room.tiles, env.action)
     step = progress.learning_rate / len(room.tiles) * td_error
-    move_sum(weights, room.tiles, env.action, step)
+    for k in range(len(room.tiles)):
+        weights[room.tiles[k], env.action] += step
     return float(td_error)
 
 

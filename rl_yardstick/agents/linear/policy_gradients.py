@@ -18,8 +18,7 @@ from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE
 from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import NotCompilable
-from rl_yardstick.agents.linear.algorithm import TileAlgorithm
-from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, look, move_sum
+from rl_yardstick.agents.linear.algorithm import LinearAgent, TileAlgorithm, add_up, look
 from rl_yardstick.envs.known_models import time_limit
 from rl_yardstick.machine_code.compiling import called
 from rl_yardstick.mdp.transition_model import Floats, Ints
@@ -48,7 +47,9 @@ def ascend(agent: LinearAgent, tiles: Ints, action: int, step: float) -> None:
     make_probabilities(probabilities)
     for other in range(len(probabilities)):
         chosen = 1.0 if other == action else 0.0
-        move_sum(agent.weights, tiles, other, step * (chosen - probabilities[other]))
+        move = step * (chosen - probabilities[other])
+        for k in range(len(tiles)):
+            agent.weights[tiles[k], other] += move
 
 
 @called
@@ -58,13 +59,6 @@ def state_value(weights: Floats, tiles: Ints) -> float:
     for k in range(len(tiles)):
         total += weights[tiles[k]]
     return total
-
-
-@called
-def move_state_value(weights: Floats, tiles: Ints, step: float) -> None:
-    """Move the sum of a state value's weights over the tiles by a step."""
-    for k in range(len(tiles)):
-        weights[tiles[k]] += step
 
 
 class SoftmaxAlgorithm(TileAlgorithm):
@@ -128,7 +122,9 @@ def actor_critic_step(agent: LinearAgent, env: Any, progress: Any, discount: flo
     follows = 0.0 if env.terminated else agent.settings.gamma * state_value(values, room.next_tiles)
     td_error = env.reward + follows - state_value(values, room.tiles)
     n_tilings = len(room.tiles)
-    move_state_value(values, room.tiles, agent.settings.value_step_size / n_tilings * td_error)
+    value_step = agent.settings.value_step_size / n_tilings * td_error
+    for k in range(n_tilings):
+        values[room.tiles[k]] += value_step
     step = progress.learning_rate / n_tilings * discount * td_error
     ascend(agent, room.tiles, env.action, step)
     return float(td_error)
@@ -214,8 +210,9 @@ def reinforce_step(agent: LinearAgent, i: int, t: int, step: float) -> float:
     advantage = kept.rewards[i, t]
     if len(kept.values) > 0:
         advantage -= state_value(kept.values, room.tiles)
-        value_step = settings.value_step_size / len(room.tiles)
-        move_state_value(kept.values, room.tiles, value_step * advantage)
+        value_step = settings.value_step_size / len(room.tiles) * advantage
+        for k in range(len(room.tiles)):
+            kept.values[room.tiles[k]] += value_step
     ascend(agent, room.tiles, kept.actions[i, t], step * advantage)
     return float(advantage)
 

@@ -251,11 +251,12 @@ class NetworkTraining:
         self.trained.take_over()
         self.lagging.take_over()
 
-    def read_generator(self) -> None:
-        """Use the agent's generator, which a callback may have replaced."""
+    def read_actor(self) -> None:
+        """Use the agent's generator and weights, which a callback may have replaced."""
         if self.agent.rng is not self.generator:
             self.generator = self.agent.rng
             self.held.rng[:] = handles_of([self.generator])
+        self.trained.take_over()
 
     def show(self, observations: Any) -> None:
         """Copy and check observations of environments in Python."""
@@ -340,22 +341,30 @@ class NetworkEngine(CompiledEngine):
     def _learn_from_last(self, n_episodes: int, keep_going: bool) -> None:
         if not keep_going:
             # As in the library, the agent does not learn from the last step and its rollout.
-            self.training.give_up_rollout()
+            for count in self.training.rollout_counts:
+                self.training.place[count] = 0
             return
         super()._learn_from_last(n_episodes, keep_going)
         self.training.record()
 
     @property
     def _log_count(self) -> int:
-        return int(self.training.log_count)
+        """The number of episodes, or of rollouts."""
+        if self.training.goes_by_episodes:
+            return super()._log_count
+        return int(self.training.place["n_rollouts"][0])
 
     def _write_log(self) -> None:
-        self.training.write_log()
+        counted = () if self.training.goes_by_episodes else (self._log_count,)
+        self.agent.dump_logs(*counted)
 
     def _take_over_counts(self, n_steps: int, n_episodes: int) -> None:
-        self.training.take_over_progress(float(self.progress[0]["remaining"]))
+        # Agents with rollouts of a fixed length have the share after the last rollout.
+        by_episodes = self.training.goes_by_episodes
+        place = self.progress if by_episodes else self.training.place
+        self.agent._current_progress_remaining = float(place["remaining"][0])
         self._take_over_position()
-        if self.training.goes_by_episodes:
+        if by_episodes:
             self.agent._episode_num += n_episodes
 
     def _take_over_position(self) -> None:

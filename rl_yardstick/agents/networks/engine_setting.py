@@ -6,8 +6,8 @@ import inspect
 import statistics
 import time
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self, get_args
 
@@ -43,7 +43,7 @@ from rl_yardstick.agents.networks.engine import (
     network_player,
 )
 from rl_yardstick.agents.networks.perceptron import Inputs, one_thread
-from rl_yardstick.machine_code.cache import folder
+from rl_yardstick.machine_code.compiling import folder
 
 # Conditions for compiled trainings of the library's agents.
 
@@ -127,7 +127,7 @@ class Work:
         """Processor seconds in the library's loop."""
         update = UPDATE[self.kind] + UPDATE_LAYER[self.kind] * self.n_layers
         update += UPDATE_WEIGHT * self.batch_size * self.n_weights
-        return self._n_calls * CALL + self.n_steps * ENV_STEP + self.n_updates * update
+        return self.n_steps / self.n_envs * CALL + self.n_steps * ENV_STEP + self.n_updates * update
 
     @property
     def compiled_seconds(self) -> float:
@@ -139,17 +139,8 @@ class Work:
     @property
     def bridged_seconds(self) -> float:
         """Processor seconds in compiled code with the environment in Python."""
-        in_python = self._n_calls * BRIDGE_CALL + self.n_steps * ENV_STEP
+        in_python = self.n_steps / self.n_envs * BRIDGE_CALL + self.n_steps * ENV_STEP
         return self.compiled_seconds + in_python
-
-    @property
-    def is_worth_compiling(self) -> bool:
-        """Whether ``auto`` compiles it."""
-        return self.library_seconds - self.compiled_seconds >= WORTH_COMPILING
-
-    @property
-    def _n_calls(self) -> float:
-        return self.n_steps / self.n_envs
 
 
 def work_of(
@@ -200,18 +191,6 @@ def machine_pace() -> float:
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
 TOO_SHORT = "so short a training is not worth compiling"
-
-
-def do_without_torch_compiler() -> None:
-    """Let optimizers be made, saved and loaded without importing PyTorch's compiler.
-
-    At the first call their methods import the compiler, which takes a second, only to exclude
-    themselves from it; unless they find themselves in this attribute. ``step`` imports it anyway.
-    """
-    for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
-        method = getattr(getattr(Optimizer, name), "__wrapped__", None)
-        if method is not None and not hasattr(method, "__dynamo_disable"):
-            setattr(method, "__dynamo_disable", method)  # no name to mangle
 
 
 @dataclass(frozen=True)
@@ -270,7 +249,12 @@ class CompiledNetworks(BaseAlgorithm):
         self.engine_in_use = ""
         self._training: Any = None
         self._sharing = False  # whether the library's loop acts and learns by compiled code
-        do_without_torch_compiler()
+        # At the first call these methods import PyTorch's compiler, which takes a second, only to
+        # exclude themselves from it; unless they find themselves in this attribute.
+        for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
+            method = getattr(getattr(Optimizer, name), "__wrapped__", None)
+            if method is not None and not hasattr(method, "__dynamo_disable"):
+                setattr(method, "__dynamo_disable", method)  # no name to mangle
         super().__init__(*args, **kwargs)
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -323,10 +307,16 @@ class CompiledNetworks(BaseAlgorithm):
         if not plan.is_compiled:
             library.learn(**given.arguments)
         elif plan.world is None:
-            with self._learning_compiled():
-                library.learn(**given.arguments)
+            with one_thread():
+                self._sharing = True
+                try:
+                    library.learn(**given.arguments)
+                finally:
+                    if self._training is not None:
+                        self._training.close()
+                    self._training, self._sharing = None, False
         else:
-            self._learn_compiled(*plan.world, **given.arguments)
+            self._learn_compiled(plan.world, **given.arguments)
         return self
 
     def engine_plan(
@@ -340,8 +330,10 @@ class CompiledNetworks(BaseAlgorithm):
             self._check_compilable()
         except NotCompilable as reason:
             return EnginePlan(is_compiled=False, reason=str(reason))
-        if engine == "auto" and not self.work(total_timesteps, callback).is_worth_compiling:
-            return EnginePlan(is_compiled=False, reason=TOO_SHORT)
+        if engine == "auto":
+            work = self.work(total_timesteps, callback)
+            if not work.library_seconds - work.compiled_seconds >= WORTH_COMPILING:
+                return EnginePlan(is_compiled=False, reason=TOO_SHORT)
         try:
             return EnginePlan(is_compiled=True, world=self._world_for(callback))
         except NotCompilable as reason:
@@ -358,18 +350,6 @@ class CompiledNetworks(BaseAlgorithm):
     @abstractmethod
     def _work_of(self, n_steps: float) -> Work:
         """The work of a training of ``n_steps`` steps."""
-
-    @contextmanager
-    def _learning_compiled(self) -> Iterator[None]:
-        """Let the library's loop act and learn by compiled code."""
-        with one_thread():
-            self._sharing = True
-            try:
-                yield
-            finally:
-                if self._training is not None:
-                    self._training.close()
-                self._training, self._sharing = None, False
 
     def _shared_training(self) -> Any:
         """The current training, made at the first rollout.
@@ -403,8 +383,7 @@ class CompiledNetworks(BaseAlgorithm):
 
     def _learn_compiled(
         self,
-        world: Any,
-        seen: Any,
+        world: tuple[Any, Any],  # the environments as compiled code, and how to read them
         total_timesteps: int,
         callback: Any,
         log_interval: int | None,
@@ -419,8 +398,8 @@ class CompiledNetworks(BaseAlgorithm):
         if self.num_timesteps < total_timesteps:
             # An interrupted run restores its last state here.
             callback.on_rollout_start()
-            with one_thread(), closing(self.training_kind(self, seen)) as training:
-                NetworkEngine(training, world, callback, log_interval).run(total_timesteps)
+            with one_thread(), closing(self.training_kind(self, world[1])) as training:
+                NetworkEngine(training, world[0], callback, log_interval).run(total_timesteps)
         callback.on_training_end()
 
     def get_parameters(self) -> dict[str, dict[str, Any]]:

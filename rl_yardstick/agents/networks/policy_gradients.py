@@ -543,12 +543,13 @@ class PolicyTraining(NetworkTraining):
 
     # It logs by rollouts; as in the library, a budget of episodes does not affect the schedules.
     goes_by_episodes = False
+    rollout_counts = ("step", "n_rollouts")
 
     def __init__(self, agent: Any, seen: Any) -> None:
         super().__init__(agent, seen)
         actor, critic = (network.layers for network in self.networks)
         n_steps = agent.n_steps * agent.n_envs
-        size = min(agent.minibatch_size or n_steps, n_steps)
+        size = min(getattr(agent, "batch_size", n_steps), n_steps)
         rows = max(size, agent.n_envs)
         flat = self.trained.vector
         self.recorded, self.place = 0, record_of(PLACE)
@@ -613,7 +614,7 @@ class PolicyTraining(NetworkTraining):
 
     def read_settings(self) -> None:
         """Read settings that a callback may have changed."""
-        self.read_generator()
+        self.read_actor()
         self.read_tensors()
         self.held.rules[:] = self._rules(_bound)
 
@@ -637,14 +638,6 @@ class PolicyTraining(NetworkTraining):
         functions = (choose_randomly, evaluate, estimate_advantages, train)
         addresses = (address_of(function, self.learner) for function in functions)
         return PolicyAgent(self.learner, self.memory, self.seen, *addresses)
-
-    def take_over_progress(self, remaining: float) -> None:
-        """Set the agent's share of the training that remained after the last rollout."""
-        self.agent._current_progress_remaining = float(self.place["remaining"][0])
-
-    def give_up_rollout(self) -> None:
-        """Reset the counts of steps and rollouts."""
-        self.place["step"] = self.place["n_rollouts"] = 0
 
     def read(self) -> None:
         """Copy the agent's counters into the compiled record."""
@@ -674,16 +667,9 @@ class PolicyTraining(NetworkTraining):
         if log_interval is None:
             return Horizon()
         in_rollout = self.agent.n_steps - int(self.place["step"][0])
-        return Horizon(in_rollout + -(self.log_count + 1) % log_interval * self.agent.n_steps)
-
-    @property
-    def log_count(self) -> int:
-        """The number of rollouts."""
-        return int(self.place["n_rollouts"][0])
-
-    def write_log(self) -> None:
-        """Write a log record."""
-        self.agent.dump_logs(self.log_count)
+        return Horizon(
+            in_rollout + -(int(self.place["n_rollouts"][0]) + 1) % log_interval * self.agent.n_steps
+        )
 
     def train(self) -> None:
         """Learn from the rollout, with environments in Python."""
@@ -752,8 +738,7 @@ class PolicyTraining(NetworkTraining):
         """Actions for the present observations, stored in the rollout with their values."""
         actions = np.zeros(self.agent.n_envs, np.int64)
         self.place["step"] = step
-        self.read_generator()
-        self.trained.take_over()
+        self.read_actor()
         self.show(self.agent._last_obs)
         act_on_rows(self.learner, self.shown, actions)
         self.memory.held.observations[step] = self.shown
@@ -802,11 +787,6 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         self.collected = 0  # steps so far of the current rollout in the compiled loop
         super().__init__(*args, **kwargs)
 
-    @property
-    def minibatch_size(self) -> int | None:
-        """Steps in a minibatch; None for a whole rollout."""
-        return getattr(self, "batch_size", None)
-
     def _check_own(self) -> None:
         if type(self.rollout_buffer) is not RolloutBuffer:
             raise NotCompilable("its rollout buffer is of another kind")
@@ -827,7 +807,7 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
 
     def _work_of(self, n_steps: float) -> Work:
         rollout = self.n_steps * self.n_envs
-        batch_size = self.minibatch_size or rollout
+        batch_size = getattr(self, "batch_size", rollout)
         n_rollouts = math.ceil(n_steps / rollout)
         n_updates = n_rollouts * getattr(self, "n_epochs", 1) * math.ceil(rollout / batch_size)
         return work_of(

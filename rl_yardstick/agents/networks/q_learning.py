@@ -417,6 +417,7 @@ class QTraining(NetworkTraining):
     """DQN, double DQN or deep Q-learning in training."""
 
     goes_by_episodes = True  # in its log; and a budget of episodes affects the schedules
+    rollout_counts = ("collected", "collected_episodes")  # since the last training
 
     def __init__(self, agent: Any, seen: Any) -> None:
         super().__init__(agent, seen)
@@ -507,7 +508,7 @@ class QTraining(NetworkTraining):
 
     def read_settings(self) -> None:
         """Read settings that a callback may have changed."""
-        self.read_generator()
+        self.read_actor()
         self.read_tensors()
         self.held.rules[:] = self._rules()
         env = self.agent.get_vec_normalize_env()
@@ -515,14 +516,6 @@ class QTraining(NetworkTraining):
             memory = self.memory.held
             memory.centre[:] = env.obs_rms.mean.ravel()
             memory.spread[:] = np.sqrt(env.obs_rms.var + env.epsilon).ravel()
-
-    def take_over_progress(self, remaining: float) -> None:
-        """Set the agent's remaining share of the training, after each step."""
-        self.agent._current_progress_remaining = remaining
-
-    def give_up_rollout(self) -> None:
-        """Reset the counts of steps and episodes since the last training."""
-        self.place["collected"] = self.place["collected_episodes"] = 0
 
     def read(self) -> None:
         """Copy the agent's counters into the compiled record."""
@@ -555,20 +548,10 @@ class QTraining(NetworkTraining):
             return Horizon()
         return Horizon(episodes=log_interval - self.agent._episode_num % log_interval)
 
-    @property
-    def log_count(self) -> int:
-        """The number of episodes."""
-        return int(self.agent._episode_num)
-
-    def write_log(self) -> None:
-        """Write a log record."""
-        self.agent.dump_logs()
-
     def act(self, learning_starts: int) -> Ints:
         """Actions for the agent's present observations, with environments in Python."""
         self.read()
-        self.read_generator()
-        self.trained.take_over()
+        self.read_actor()
         self.held.rules["learning_starts"] = learning_starts
         self.show(self.agent._last_obs)
         actions = np.zeros(len(self.shown), np.int64)

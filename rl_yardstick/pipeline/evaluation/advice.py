@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from rl_yardstick.agents.planning import PlanningAgent
-from rl_yardstick.agents.reference import RandomAgent
+from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.envs.known_models import observations_of_states, transition_model
 from rl_yardstick.mdp import TransitionModel, policy_return, state_visitation, value_iteration
 from rl_yardstick.mdp.transition_model import Floats

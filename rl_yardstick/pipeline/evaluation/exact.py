@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from rl_yardstick.agents.planning import PlanningAgent
-from rl_yardstick.agents.reference import RandomAgent
+from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.envs.known_models import (
     action_masks_of_states,
     model_check,

@@ -21,11 +21,9 @@ from rl_yardstick.agents.bandits.rules import PreferenceBandit
 from rl_yardstick.agents.bandits.tables import ValueBandit
 from rl_yardstick.agents.common.exploration import BOLTZMANN
 from rl_yardstick.agents.common.masks import check_masks_exist, present_masks
-from rl_yardstick.agents.linear.algorithm import TileAlgorithm
+from rl_yardstick.agents.linear.algorithm import TileAlgorithm, tiles_of_all, vectors_of
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
-from rl_yardstick.agents.linear.tiles import tiles_of_all, vectors_of
-from rl_yardstick.agents.planning import PlanningAgent
-from rl_yardstick.agents.reference import RandomAgent
+from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.errors import UserError

@@ -28,13 +28,11 @@ from rl_yardstick.report.series import (
     SPREAD,
     Curve,
     Pulls,
-    PullSeries,
     mean_of,
     mean_regret,
     regret_of_runs,
 )
-from rl_yardstick.report.why import whys_of
-from rl_yardstick.report.words import number
+from rl_yardstick.report.words import number, whys_of
 
 MOST_ARMS = 40  # over all contexts, in a table or in a figure
 
@@ -51,7 +49,27 @@ def bandits(report: Report) -> Section | None:
         "spread": SPREAD,
         "has_bounds": any(series is not None and series.bounds for series in bandits),
     }
-    data = [None if series is None else _bandit_data(series) for series in bandits]
+    data = [
+        None
+        if series is None
+        else {
+            "best": series.best,
+            "bounds": series.bounds,
+            "curves": {
+                agent: {
+                    "x": pulls.pulls,
+                    "reward": pulls.reward,
+                    "optimal": pulls.optimal,
+                    "regret": {"mean": mean_regret(pulls), "runs": regret_of_runs(pulls)},
+                    "simple": pulls.simple_regret,
+                }
+                for agent, pulls in series.pulls.items()
+            },
+            "arms": series.arms if series.arms and len(series.arms.names) <= MOST_ARMS else None,
+            "beliefs": series.beliefs,
+        }
+        for series in bandits
+    ]
     return Section("bandits", "Pulls and regret", context, places=data, by_environment=True)
 
 
@@ -65,25 +83,6 @@ def _by_arm(pulls: Pulls) -> dict[str, Any] | None:
     # NaN where an agent never saw the context.
     regrets = {agent: (share * gaps).sum(axis=1) for agent, share in shares.items()}
     return {"means": means, "gaps": gaps, "shares": shares, "regrets": regrets}
-
-
-def _bandit_data(series: PullSeries) -> dict[str, Any]:
-    return {
-        "best": series.best,
-        "bounds": series.bounds,
-        "curves": {
-            agent: {
-                "x": pulls.pulls,
-                "reward": pulls.reward,
-                "optimal": pulls.optimal,
-                "regret": {"mean": mean_regret(pulls), "runs": regret_of_runs(pulls)},
-                "simple": pulls.simple_regret,
-            }
-            for agent, pulls in series.pulls.items()
-        },
-        "arms": series.arms if series.arms and len(series.arms.names) <= MOST_ARMS else None,
-        "beliefs": series.beliefs,
-    }
 
 
 MOST_EXPLAINED = 8  # the largest number of agents per environment, because each is loaded
@@ -185,7 +184,8 @@ def _policy_data(
     optimum = next(iter(maps.values()))
     return {
         **layout_data(layout),
-        "matters": _digits(model.reachable),
+        # Numbers below ten as one text, which is shortest; also the actions below.
+        "matters": "".join(map(str, model.reachable.astype(np.int64).tolist())),
         "optimum": {
             "values": optimum["optimal_values"],
             # Bit a of a state's number is set if action a is optimal there.
@@ -197,7 +197,9 @@ def _policy_data(
                 "seed": seed,
                 "steps": arrays["timesteps"],
                 "values": arrays["values"],
-                "actions": [_digits(actions) for actions in arrays["actions"]],
+                "actions": [
+                    "".join(map(str, row)) for row in arrays["actions"].astype(np.int64).tolist()
+                ],
             }
             for (agent, seed), arrays in maps.items()
         ],
@@ -227,11 +229,6 @@ def _read_maps(
             return {key: found for key, found in maps.items() if key[1] != run.seed}
         maps[run.agent, run.seed] = arrays
     return maps
-
-
-def _digits(numbers: NDArray[Any]) -> str:
-    """Numbers below ten as one text, which is shortest."""
-    return "".join(map(str, numbers.astype(np.int64).tolist()))
 
 
 MOST_FILMED = 8  # agents of an environment, the best of them
