@@ -66,12 +66,10 @@ class Checkpoint(BlockCallback):
             self.episodes_seen += int(np.sum(self.locals["dones"]))
             if self.episodes_seen // self.every_n_episodes == before // self.every_n_episodes:
                 return True
-        model: Any = self.model
-        save_agent(model, self.folder / f"rl_model_{model.num_timesteps}_steps.zip")
-        if self.with_replay_buffer and getattr(model, "replay_buffer", None) is not None:
-            name = f"rl_model_replay_buffer_{model.num_timesteps}_steps.pkl"
-            with replacing(self.folder / name) as beside:
-                model.save_replay_buffer(beside)
+        steps = f"{self.num_timesteps}_steps"
+        buffer = self.folder / f"rl_model_replay_buffer_{steps}.pkl"
+        path = self.folder / f"rl_model_{steps}.zip"
+        save_agent(self.model, path, buffer if self.with_replay_buffer else None)
         return True
 
 

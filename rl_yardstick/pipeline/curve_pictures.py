@@ -1,4 +1,4 @@
-"""Draws pictures of a run: its learning curve and its pulls."""
+"""Draws pictures of a run: its learning curve and its diagnosis."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.files import replacing
-from rl_yardstick.pipeline.run import LAST_PULLS
 from rl_yardstick.safe_files.files import NO_LIMIT, content_of
 
 if TYPE_CHECKING:
@@ -184,32 +182,3 @@ def draw_diagnosis(folder: Path, title: str) -> None:
     figure.suptitle(title, x=0.01, ha="left")
     figure.supxlabel("environment steps", fontsize=10)
     write_png(figure, folder / "diagnosis.png")
-
-
-def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> None:
-    """Draw reward, share of a best arm and regret by pull; see `PullLog.arrays`."""
-    from matplotlib.figure import Figure
-
-    # A pull that is not in the log has no reward.
-    kept = pulls["matched"].T.ravel()
-    rewards, regrets = (
-        pulls[name].T.ravel()[kept].astype(np.float64) for name in ("rewards", "regrets")
-    )
-    if not len(rewards):
-        return
-    panels: dict[str, tuple[Floats, str]] = {
-        f"reward, mean of {LAST_PULLS} pulls": (moving_average(rewards, LAST_PULLS), BLUE)
-    }
-    if not np.isnan(regrets).any():
-        share = moving_average((regrets == 0.0).astype(np.float64), LAST_PULLS)
-        panels[f"best arm, share of {LAST_PULLS} pulls"] = share, GREEN
-        panels["cumulative regret"] = np.cumsum(regrets), ORANGE
-    figure = Figure(figsize=(1 + 3.7 * len(panels), 4), dpi=120, layout="constrained")
-    places = figure.subplots(1, len(panels), squeeze=False)[0]
-    shown = np.unique(np.linspace(0, len(rewards) - 1, MAX_POINTS).round().astype(np.int64))
-    for axes, (word, (values, colour)) in zip(places, panels.items(), strict=True):
-        axes.plot(shown + 1, values[shown], color=colour)
-        axes.set(ylabel=word, xlabel="pulls" if kept.all() else "pulls in the log")
-        _style(axes)
-    figure.suptitle(title, x=0.01, ha="left")
-    write_png(figure, path)

@@ -17,14 +17,7 @@ from rl_yardstick.envs.drawing import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, S
 from rl_yardstick.envs.drawing import ORANGE as AMBER
 from rl_yardstick.envs.layout import GOAL, PRIZE, START, TRAP, WALL, GridLayout
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.pipeline.curve_pictures import (
-    ORANGE,
-    draw_diagnosis,
-    draw_learning_curve,
-    draw_pulls,
-    fix_layout,
-    write_png,
-)
+from rl_yardstick.pipeline import curve_pictures
 from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMap, value_map
 
@@ -41,23 +34,18 @@ def draw(folder: Path, parts: Any) -> None:
     if not spec.pictures:
         return
     with parts.run.console.status("drawing the pictures"):
-        has_pulls = parts.pulls is not None and parts.pulls.n_calls > 0
-        if has_pulls:
-            draw_pulls(folder / "pulls.png", spec.title, parts.pulls.arrays())
-        if not has_pulls or evaluation.evaluations_timesteps:
-            first_step, scale = agent._num_timesteps_at_start, parts.judge.yardstick
-            changed = bool(training_changes(spec))
+        if parts.pulled is None or evaluation.evaluations_timesteps:
+            scale = None if parts.final is None else parts.final.yardstick
             means = [float(np.mean(row)) for row in evaluation.evaluations_results]
             evaluations = dict(zip(evaluation.evaluations_timesteps, means, strict=True))
-            draw_learning_curve(
-                folder, spec.title, evaluations, first_step, scale, on_variant=changed
-            )
+            places = folder, spec.title, evaluations, agent._num_timesteps_at_start, scale
+            curve_pictures.draw_learning_curve(*places, on_variant=bool(training_changes(spec)))
         if evaluation.value_maps is not None and evaluation.is_asked_for:
             found = value_map(evaluation.value_maps.evaluator, agent)
             if found is not None:
                 draw_value_map(folder / "value_map.png", spec.title, found)
         if evaluation.critics is not None:
-            draw_diagnosis(folder, spec.title)
+            curve_pictures.draw_diagnosis(folder, spec.title)
 
 
 # --- maps -----------------------------------------------------------------------------------------
@@ -102,16 +90,14 @@ class Policy:
         return columns, rows
 
 
-def policies_in(found: ValueMap, layer: int) -> list[Policy]:
-    """The agent's policy and the optimal ones in one layer."""
-    here, common = found.layout.layers == layer, (found.matters, found.differs)
-    taken = np.eye(len(found.layout.moves), dtype=np.bool_)[found.actions]
-    agent = found.visited, found.values, taken
-    best = found.optimal_visited, found.optimal_values, found.optimal_actions
-    return [
-        Policy(found.layout, layer, *(array[here] for array in (*common, *which)))
-        for which in (agent, best)
-    ]
+def policy_in(found: ValueMap, layer: int, is_best: bool) -> Policy:
+    """The agent's policy, or the optimal ones, in one layer."""
+    which = found.optimal_visited, found.optimal_values, found.optimal_actions
+    if not is_best:
+        taken = np.eye(len(found.layout.moves), dtype=np.bool_)[found.actions]
+        which = found.visited, found.values, taken
+    arrays, here = (found.matters, found.differs, *which), found.layout.layers == layer
+    return Policy(found.layout, layer, *(array[here] for array in arrays))
 
 
 def draw_ground(axes: Axes, policy: Policy, scale: Normalize, colours: Colormap) -> None:
@@ -202,14 +188,8 @@ def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
 
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * 0.44
     frames = list(np.stack(policy.places(policy.differs), axis=-1)[:, None] + corners)
-    style: Any = {"color": ORANGE, "linewidth": min(max(cell / 16, 1.0), 2.4)}
+    style: Any = {"color": curve_pictures.ORANGE, "linewidth": min(max(cell / 16, 1.0), 2.4)}
     axes.add_collection(LineCollection(frames, joinstyle="miter", zorder=4, **style))
-
-
-def return_number(value: float) -> str:
-    """A return with four significant digits, as in the tables of a study."""
-    text = f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.0f}"
-    return text.replace("-", "\N{MINUS SIGN}")
 
 
 # --- whole pictures: two maps side by side --------------------------------------------------------
@@ -229,7 +209,7 @@ class Side(NamedTuple):
 
     title: str
     shown: ValueMap
-    which: int  # 0 for the agent's policy, 1 for the optimal ones
+    is_best: bool  # whether it shows the optimal policies, not the agent's
     scale: Normalize
     colours: Colormap
     decimals: int
@@ -239,7 +219,7 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
     """Draw a map into a PNG file; colours are exact values, scaled by the optimal ones."""
     agent = _agents_side(found)
     best = f"optimum, all best actions: return {_at_start(found, found.optimal_values)}"
-    sides = agent, agent._replace(title=best, which=1)
+    sides = agent, agent._replace(title=best, is_best=True)
     _draw(path, title, sides, agent, "expected return from here on")
 
 
@@ -252,7 +232,7 @@ def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> No
     costs = replace(found, values=shares, matters=found.visited & (shares >= LEAST_SHARE))
     told = f"loss of its actions: {losses.sum():,.4g} in total"
     scale = 0.0, max(float(shares.max()), 1e-12)
-    cost = Side(told, costs, 0, *_scaled(scale, COST_COLOURS), 0)
+    cost = Side(told, costs, False, *_scaled(scale, COST_COLOURS), 0)
     bar = "share of the gap lost there, in per cent"
     _draw(path, title, (_agents_side(found), cost), cost, bar)
 
@@ -262,11 +242,14 @@ def _agents_side(found: ValueMap) -> Side:
     low, high = float(best.min()), float(best.max())
     colours = _scaled((low, high if high > low else low + 1), VALUE_COLOURS)
     title = f"agent: return {_at_start(found, found.values)}"
-    return Side(title, found, 0, *colours, decimals_for(found))
+    return Side(title, found, False, *colours, decimals_for(found))
 
 
 def _at_start(found: ValueMap, values: Floats) -> str:
-    return return_number(float(found.initial @ values))
+    """The return from the start with four significant digits, as in the tables of a study."""
+    value = float(found.initial @ values)
+    text = f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.0f}"
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def _scaled(ends: tuple[float, float], names: tuple[str, ...]) -> tuple[Normalize, Colormap]:
@@ -301,19 +284,19 @@ def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar
     n_columns = int(np.clip(figure.get_figwidth() / 2.6, 1, 4))
     figure.legend(handles=list(_legend(found, sides[0].scale)), ncols=n_columns, **style)
     figure.suptitle(title, x=0.01, ha="left")
-    fix_layout(figure)  # artists inside the panels need no margin
+    curve_pictures.fix_layout(figure)  # artists inside the panels need no margin
     for pair, layer in zip(pairs, layers, strict=True):
         for axes, side in zip(pair, sides, strict=True):
-            policy = policies_in(side.shown, layer)[side.which]
+            policy = policy_in(side.shown, layer, side.is_best)
             draw_ground(axes, policy, side.scale, side.colours)
             draw_marks(axes, policy, cell)
             font = min(0.2 * cell, 9.0)
-            width = min(2.9 / cell, 0.085) * (0.5 if side.which else 1)
+            width = min(2.9 / cell, 0.085) * (0.5 if side.is_best else 1)
             draw_arrows(axes, policy, width, with_numbers=font >= SMALLEST_FONT)
             if font >= SMALLEST_FONT:
                 draw_numbers(axes, policy, font, side.decimals)
             mark_differing(axes, policy, cell)
-    write_png(figure, path)
+    curve_pictures.write_png(figure, path)
 
 
 def decimals_for(found: ValueMap) -> int:
@@ -364,7 +347,7 @@ def _legend(found: ValueMap, scale: Normalize) -> Iterator[Artist]:
     yield Line2D([], [], linewidth=2, label="on the way from the start", **arrow)
     yield Line2D([], [], linewidth=1.5, alpha=0.45, label="elsewhere", **arrow)
     differs = f"not an optimal action ({found.differs.sum()} of {found.matters.sum()} states)"
-    yield Patch(facecolor="none", edgecolor=ORANGE, linewidth=2, label=differs)
+    yield Patch(facecolor="none", edgecolor=curve_pictures.ORANGE, linewidth=2, label=differs)
     if is_below(found.values[found.matters], scale).any():
         yield Patch(label="value below the scale", **BELOW)
     letters = set("".join(found.layout.rows))

@@ -151,8 +151,8 @@ class Run:
         write_json(self.path / RECORD, {**known, **facts, **figures})
 
 
-def save_agent(agent: Any, path: Path) -> None:
-    """Save an agent's zip whole or not at all, and the statistics of its VecNormalize."""
+def save_agent(agent: Any, path: Path, buffer: Path | None = None) -> None:
+    """Save an agent's zip whole or not at all, its VecNormalize's statistics and replay buffer."""
     from rl_yardstick.pipeline.finite_numbers import check_model
 
     check_model(agent)
@@ -161,6 +161,9 @@ def save_agent(agent: Any, path: Path) -> None:
     if (statistics := agent.get_vec_normalize_env()) is not None:
         with replacing(statistics_beside(path)) as beside:
             statistics.save(str(beside))
+    if buffer is not None and getattr(agent, "replay_buffer", None) is not None:
+        with replacing(buffer) as beside:
+            agent.save_replay_buffer(beside)
 
 
 def statistics_beside(model: Path) -> Path:
