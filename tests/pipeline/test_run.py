@@ -202,7 +202,7 @@ def test_when_evaluations_come(entry, fields, steps):
     assert (steps is None) == (outcome.final is None) == (not path.exists())
     if steps is not None:
         assert np.load(path)["timesteps"].tolist() == steps
-        assert outcome.best_timesteps in steps
+        assert outcome.evaluation.best_timesteps in steps
 
 
 class Sick(gym.Env):
