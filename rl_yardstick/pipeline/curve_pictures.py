@@ -1,4 +1,4 @@
-"""Draws pictures of a run: its learning curve and its diagnosis."""
+"""Draws the learning curve of a run, and reads its diagnosis."""
 
 from __future__ import annotations
 
@@ -162,23 +162,3 @@ def read_diagnosis(content: bytes) -> dict[str, Floats]:
     names, *rows = csv.reader(content.decode().splitlines())
     table = [[float(cell or "nan") for cell in row] for row in rows]
     return dict(zip(names, np.array(table).T, strict=True))
-
-
-def draw_diagnosis(folder: Path, title: str) -> None:
-    """Draw the errors of values, advantages and gradients during training."""
-    from matplotlib.figure import Figure
-
-    found = read_diagnosis((folder / "diagnosis.csv").read_bytes())
-    names = [name for name in MEANINGS if name in found]
-    n_rows = -(-len(names) // 3)
-    figure = Figure(figsize=(12, 2.6 * n_rows), dpi=100, layout="constrained")
-    places = figure.subplots(n_rows, 3, squeeze=False).ravel()
-    for axes in places[len(names) :]:
-        axes.remove()
-    for axes, name in zip(places, names, strict=False):
-        axes.plot(found["timesteps"], found[name], ".-", color=BLUE)
-        axes.set_title(MEANINGS[name], loc="left", fontsize=10)
-        _style(axes)
-    figure.suptitle(title, x=0.01, ha="left")
-    figure.supxlabel("environment steps", fontsize=10)
-    write_png(figure, folder / "diagnosis.png")

@@ -44,8 +44,6 @@ def draw(folder: Path, parts: Any) -> None:
             found = value_map(evaluation.value_maps.evaluator, agent)
             if found is not None:
                 draw_value_map(folder / "value_map.png", spec.title, found)
-        if evaluation.critics is not None:
-            curve_pictures.draw_diagnosis(folder, spec.title)
 
 
 # --- maps -----------------------------------------------------------------------------------------
