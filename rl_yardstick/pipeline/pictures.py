@@ -1,4 +1,4 @@
-"""The pictures of a run; among them a policy and its values on the map of a grid world.
+"""The pictures of a run: its learning curve, and a policy with its values on a grid world's map.
 
 On maps, columns are on the horizontal axis, rows on the vertical one, downwards; the centre of a
 cell has integer coordinates. ``cell`` is the width of a cell in points.
@@ -6,20 +6,24 @@ cell has integer coordinates. ``cell`` is the width of a cell in points.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from rl_yardstick.envs.drawing import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, SHELF, WHITE, Colour
 from rl_yardstick.envs.drawing import ORANGE as AMBER
 from rl_yardstick.envs.layout import GOAL, PRIZE, START, TRAP, WALL, GridLayout
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.pipeline import curve_pictures
 from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMap, value_map
+from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+from rl_yardstick.pipeline.files import replacing
+from rl_yardstick.safe_files.files import NO_LIMIT, content_of
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -39,11 +43,119 @@ def draw(folder: Path, parts: Any) -> None:
             means = [float(np.mean(row)) for row in evaluation.evaluations_results]
             evaluations = dict(zip(evaluation.evaluations_timesteps, means, strict=True))
             places = folder, spec.title, evaluations, agent._num_timesteps_at_start, scale
-            curve_pictures.draw_learning_curve(*places, on_variant=bool(training_changes(spec)))
+            draw_learning_curve(*places, on_variant=bool(training_changes(spec)))
         if evaluation.value_maps is not None and evaluation.is_asked_for:
             found = value_map(evaluation.value_maps.evaluator, agent)
             if found is not None:
                 draw_value_map(folder / "value_map.png", spec.title, found)
+
+
+# --- learning curves ------------------------------------------------------------------------------
+
+
+def fix_layout(figure: Figure) -> None:
+    """Compute the layout now; artists that are added later do not change it."""
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+
+
+def write_png(figure: Figure, path: Path) -> None:
+    """Write a figure with its layout fixed; `Figure.savefig` would draw everything twice."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    fix_layout(figure)
+    canvas: Any = FigureCanvasAgg(figure)
+    with replacing(path) as beside:
+        canvas.print_png(beside)
+
+
+# Okabe and Ito's colours, which colour-blind readers can distinguish.
+BLUE = "#0072B2"
+ORANGE = "#D55E00"
+OPTIMAL = "#009E73"
+GREY = "#9A9A9A"
+
+MOVING_AVERAGE_EPISODES = 100
+MAX_POINTS = 5000
+
+
+def read_monitors(folder: Path) -> tuple[Floats, Floats]:
+    """For each training episode, its last step counted over all environments, and its return."""
+    contents = [content_of(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
+    rows = [
+        np.loadtxt(BytesIO(content), delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
+        for content in contents
+        if content.count(b"\n") > 2
+    ]
+    if not rows:
+        return np.empty(0), np.empty(0)
+    # The environments step together, so all have done the same number of steps.
+    steps = np.concatenate([len(contents) * np.cumsum(table[:, 1]) for table in rows])
+    returns = np.concatenate([table[:, 0] for table in rows])
+    order = np.argsort(steps, kind="stable")
+    return steps[order], returns[order]
+
+
+def draw_learning_curve(
+    folder: Path,
+    title: str,
+    evaluations: Mapping[int, float],
+    first_step: int,
+    yardstick: Yardstick | None,
+    *,
+    on_variant: bool,
+) -> None:
+    """Draw training returns, from ``first_step`` on, and evaluations by steps into a folder."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
+
+    figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
+    steps, returns = read_monitors(folder)
+    # Returns of a variant of the environment have a scale of their own.
+    apart = on_variant and len(steps) > 0 and (len(evaluations) > 0 or yardstick is not None)
+    ratios = (3, 2) if apart else (1,)
+    panels = figure.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)
+    judged, trained = panels[0, 0], panels[-1, 0]
+    judged.set_ylabel("return of an episode")
+    trained.set_xlabel("environment steps")
+    if apart:
+        trained.set_ylabel("training return")
+        trained.set_title("training, on a variant of the environment", loc="left", fontsize=10)
+    if len(steps):
+        what = "training on a variant" if on_variant and not apart else "training"
+        _draw_training(trained, steps + first_step, returns, what)
+    if evaluations:
+        style: Any = {"color": BLUE, "markersize": 4, "label": "evaluation, mean return"}
+        judged.plot(list(evaluations), list(evaluations.values()), "o-", **style)
+    if yardstick is not None:
+        most = "optimum, at most" if yardstick.is_proven else "optimum, at most (not proven)"
+        ends: dict[str, tuple[float | None, str]] = {
+            "optimum" if yardstick.at_least is None else most: (yardstick.optimum, "-"),
+            "optimum, at least": (yardstick.at_least, "--"),
+            "best random or constant policy": (yardstick.baseline, ":"),
+        }
+        for label, (height, dash) in ends.items():
+            if height is not None:
+                judged.axhline(height, color=OPTIMAL, linestyle=dash, linewidth=1.2, label=label)
+    judged.set_title(title, loc="left")
+    for axes in panels.flat:
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    # Below the axes, where the legend covers no points.
+    figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9, markerscale=2)
+    write_png(figure, folder / "learning_curve.png")
+
+
+def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> None:
+    stride = max(len(steps) // MAX_POINTS, 1)
+    label = f"{what}, " + ("each episode" if stride == 1 else f"1 episode in {stride}")
+    style: Any = {"color": GREY, "markersize": 3, "markeredgewidth": 0, "label": label}
+    axes.plot(steps[::stride], returns[::stride], "o", **style)
+    if (width := min(MOVING_AVERAGE_EPISODES, len(returns))) > 1:
+        smooth = pd.Series(returns).rolling(width, min_periods=1).mean()[::stride]
+        axes.plot(steps[::stride], smooth, color=ORANGE, label=f"{what}, mean of {width} episodes")
 
 
 # --- maps -----------------------------------------------------------------------------------------
@@ -186,7 +298,7 @@ def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
 
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * 0.44
     frames = list(np.stack(policy.places(policy.differs), axis=-1)[:, None] + corners)
-    style: Any = {"color": curve_pictures.ORANGE, "linewidth": min(max(cell / 16, 1.0), 2.4)}
+    style: Any = {"color": ORANGE, "linewidth": min(max(cell / 16, 1.0), 2.4)}
     axes.add_collection(LineCollection(frames, joinstyle="miter", zorder=4, **style))
 
 
@@ -282,7 +394,7 @@ def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar
     n_columns = int(np.clip(figure.get_figwidth() / 2.6, 1, 4))
     figure.legend(handles=list(_legend(found, sides[0].scale)), ncols=n_columns, **style)
     figure.suptitle(title, x=0.01, ha="left")
-    curve_pictures.fix_layout(figure)  # artists inside the panels need no margin
+    fix_layout(figure)  # artists inside the panels need no margin
     for pair, layer in zip(pairs, layers, strict=True):
         for axes, side in zip(pair, sides, strict=True):
             policy = policy_in(side.shown, layer, side.is_best)
@@ -294,7 +406,7 @@ def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar
             if font >= SMALLEST_FONT:
                 draw_numbers(axes, policy, font, side.decimals)
             mark_differing(axes, policy, cell)
-    curve_pictures.write_png(figure, path)
+    write_png(figure, path)
 
 
 def decimals_for(found: ValueMap) -> int:
@@ -345,7 +457,7 @@ def _legend(found: ValueMap, scale: Normalize) -> Iterator[Artist]:
     yield Line2D([], [], linewidth=2, label="on the way from the start", **arrow)
     yield Line2D([], [], linewidth=1.5, alpha=0.45, label="elsewhere", **arrow)
     differs = f"not an optimal action ({found.differs.sum()} of {found.matters.sum()} states)"
-    yield Patch(facecolor="none", edgecolor=curve_pictures.ORANGE, linewidth=2, label=differs)
+    yield Patch(facecolor="none", edgecolor=ORANGE, linewidth=2, label=differs)
     if is_below(found.values[found.matters], scale).any():
         yield Patch(label="value below the scale", **BELOW)
     letters = set("".join(found.layout.rows))

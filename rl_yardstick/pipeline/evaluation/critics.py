@@ -28,11 +28,11 @@ from rl_yardstick.envs import known_models
 from rl_yardstick.mdp import TransitionModel, state_visitation
 from rl_yardstick.mdp.gaps import PolicyValues, discounted_values, expected_estimates
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.pipeline.curve_pictures import MEANINGS
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.evaluation import policies
 from rl_yardstick.pipeline.evaluation.exact import is_wrapped_as_vector
 from rl_yardstick.pipeline.files import write_text
+from rl_yardstick.pipeline.run import MEANINGS
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # Agents that always learn the values of their exploring policy.
