@@ -125,7 +125,8 @@ class Training:
             run, eval_env, evaluator, frequencies, maps, critics
         )
         recorder = watch_of(spec, agent, maps)
-        self.watch: Watch | None = recorder  # what a page plays of the training
+        # What a page plays of the training.
+        self.watch: Watch | None = recorder or (maps if spec.watch_learning else None)
         self.pulls = callbacks.PullRecorder(run.path) if is_bandit else None
         if is_bandit and getattr(agent, "engine", None) == "compiled":  # it stops at no pull
             self.pulls, note = None, "engine: compiled keeps no pulls, so regret is not known"
