@@ -106,8 +106,8 @@ class Training:
     def __init__(self, spec: TrainSpec, run: Run, agent: BaseAlgorithm, resumes: bool) -> None:
         self.spec, self.run, self.agent = spec, run, agent
         is_bandit = agent.env is not None and agent.env.has_attr("n_arms")
-        self.judge = Judge(spec, agent, run.console)
-        exact = self.judge.exact
+        self.judge = judge = Judge(spec, agent, run.console)
+        exact = judge.exact
         self.can_be_explained = exact is not None  # its gap can be split into parts
         frequencies = callbacks.evaluation_frequencies(spec, agent, is_bandit and exact is None)
         critics = None
@@ -120,10 +120,7 @@ class Training:
         maps = None
         if exact is not None and (spec.watch_learning or exact.layout is not None):
             maps = ValueMapRecorder(run.path / "value_maps.npz", exact)
-        evaluator, eval_env = self.judge.evaluator, self.judge.env
-        self.evaluation = callbacks.EvaluationCallback(
-            run, eval_env, evaluator, frequencies, maps, critics
-        )
+        self.evaluation = callbacks.EvaluationCallback(run, judge, frequencies, maps, critics)
         recorder = watch_of(spec, agent, maps)
         # What a page plays of the training.
         self.watch: Watch | None = recorder or (maps if spec.watch_learning else None)
