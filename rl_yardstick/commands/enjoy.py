@@ -245,8 +245,8 @@ class Show:
             return
         table, figures = Table.grid(padding=(0, 1)), action_figures(self.agent, obs)
         if figures is not None:
-            table.add_row("", "action", figures.word, style="dim")
-            for action, number in enumerate(figures.numbers):
+            table.add_row("", "action", figures[0], style="dim")
+            for action, number in enumerate(figures[1]):
                 name = self.names[action] if action < len(self.names) else str(action)
                 mark = ">" if action == int(actions.reshape(-1)[0]) else ""
                 table.add_row(mark, name, f"{number:.4g}")

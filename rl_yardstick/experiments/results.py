@@ -18,11 +18,10 @@ from rl_yardstick.experiments.bandits import STATISTICS_FILE, PullStatistics, re
 from rl_yardstick.experiments.plan import Labels, PlannedRun
 from rl_yardstick.experiments.study import AS_IT_IS, SHIPPED, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.curve_pictures import MEANINGS, read_diagnosis
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.evaluation.yardstick import with_memory
 from rl_yardstick.pipeline.files import read_arrays, read_bytes
-from rl_yardstick.pipeline.run import RECORD
+from rl_yardstick.pipeline.run import MEANINGS, RECORD, read_diagnosis
 from rl_yardstick.verdicts import (
     UNBOUNDED,
     Band,

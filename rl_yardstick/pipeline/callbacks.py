@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.utils import ConstantSchedule
-from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+from stable_baselines3.common.vec_env import sync_envs_normalization
 
 from rl_yardstick.agents.bandits.runs import PullLog
 from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
@@ -66,12 +66,10 @@ class Checkpoint(BlockCallback):
             self.episodes_seen += int(np.sum(self.locals["dones"]))
             if self.episodes_seen // self.every_n_episodes == before // self.every_n_episodes:
                 return True
-        model: Any = self.model
-        save_agent(model, self.folder / f"rl_model_{model.num_timesteps}_steps.zip")
-        if self.with_replay_buffer and getattr(model, "replay_buffer", None) is not None:
-            name = f"rl_model_replay_buffer_{model.num_timesteps}_steps.pkl"
-            with replacing(self.folder / name) as beside:
-                model.save_replay_buffer(beside)
+        steps = f"{self.num_timesteps}_steps"
+        buffer = self.folder / f"rl_model_replay_buffer_{steps}.pkl"
+        path = self.folder / f"rl_model_{steps}.zip"
+        save_agent(self.model, path, buffer if self.with_replay_buffer else None)
         return True
 
 
@@ -274,16 +272,15 @@ class EvaluationCallback(EvalCallback):
     def __init__(
         self,
         run: Run,
-        eval_env: VecEnv,
-        evaluator: Any,
+        judge: Judge,
         frequencies: tuple[int, int],
         value_maps: ValueMapRecorder | None = None,
         critics: CriticRecorder | None = None,
     ) -> None:
-        super().__init__(eval_env, eval_freq=frequencies[0], verbose=0)
+        super().__init__(judge.env, eval_freq=frequencies[0], verbose=0)
         self.eval_episode_freq = frequencies[1]
         self.is_asked_for = max(frequencies) > 0
-        self.run, self.evaluator = run, evaluator
+        self.run, self.evaluator = run, judge.evaluator
         self.value_maps, self.critics = value_maps, critics
         self.best: float | None = None  # mean return of all evaluations
         self.episodes_seen = self.best_timesteps = self.best_episodes = 0

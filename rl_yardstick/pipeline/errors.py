@@ -8,27 +8,11 @@ import reprlib
 from collections.abc import Iterable
 
 _SHORT_LIST = 12
-# Hyperparameters, and other names for them, too different in spelling to be found by similarity.
-_INITIAL, _FINAL = "exploration_initial_eps", "exploration_final_eps"
+# Other names of hyperparameters, too different in spelling to be found by similarity.
 _SYNONYMS = {
-    "learning_rate": "lr alpha step_size eta",
-    f"{_FINAL} {_INITIAL}": "epsilon eps final_epsilon final_eps epsilon_end eps_end min_epsilon",
-    _INITIAL: "initial_epsilon initial_eps epsilon_start eps_start max_epsilon",
-    "exploration_decay exploration_fraction": "epsilon_decay eps_decay decay",
-    "gamma": "discount discount_factor discount_rate",
-    "gae_lambda": "lam lambda gae",
-    "ent_coef": "entropy entropy_coef entropy_coeff beta",
-    "clip_range": "clip clip_eps clip_epsilon clip_param",
-    "batch_size": "minibatch_size mini_batch_size batch",
-    "buffer_size": "replay_size memory_size replay_buffer_size",
-    "target_update_interval": "target_update target_update_freq",
-    "learning_starts": "warmup_steps start_steps",
-    "n_epochs": "epochs update_epochs",
-    "policy_kwargs": "net_arch hidden_sizes layers activation_fn",
-    "n_timesteps": "timesteps total_timesteps steps",
-    "n_episodes": "episodes num_episodes",
-    "n_envs": "num_envs nenvs",
-    "initial_q": "q_init optimistic initial_value",
+    "learning_rate": "lr alpha step_size",
+    "exploration_final_eps exploration_initial_eps": "epsilon eps",
+    "gamma": "discount discount_factor",
 }
 OTHER_NAMES = {
     other: names.split() for names, others in _SYNONYMS.items() for other in others.split()

@@ -23,10 +23,6 @@ _LOSSES = tuple(
 )
 
 
-class NotFiniteError(UserError):
-    """A number is nan or infinite where it must be finite."""
-
-
 def check_numbers(values: Any, what: str, when: str, in_rows: bool = False) -> None:
     """Check that all numbers of an array or a mapping of arrays are finite; None passes.
 
@@ -40,7 +36,7 @@ def check_numbers(values: Any, what: str, when: str, in_rows: bool = False) -> N
         flat = np.ravel(array)
         place = int(np.argmin(np.isfinite(flat)))
         row = f" of environment {place * len(array) // flat.size}" if in_rows else ""
-        raise NotFiniteError(f"{what}{row} {when} is {float(np.real(flat[place]))}")
+        raise UserError(f"{what}{row} {when} is {float(np.real(flat[place]))}")
 
 
 def check_model(model: Any) -> None:
@@ -73,7 +69,7 @@ class NumberWatch(BlockCallback):
         log = self.model.logger.name_to_value
         for name in _LOSSES:
             if name in log and not isfinite(log[name]):
-                raise NotFiniteError(f"{name} at step {self.model.num_timesteps:,} is {log[name]}")
+                raise UserError(f"{name} at step {self.model.num_timesteps:,} is {log[name]}")
 
     def _on_step(self) -> bool:
         # Algorithms that play whole episodes, such as ARS, pass other variables.

@@ -335,7 +335,14 @@ def take_statistics(env: Any, path: Path) -> None:
 def begun_with(spec: TrainSpec) -> TrainSpec:
     """The spec of a training that begins with an agent, with its masks and its normalisation."""
     path = Path(spec.trained_agent or "")
-    return _as_saved(spec, zip_data(path), statistics_of(path))
+    data = zip_data(path)
+    return _as_saved(spec, data, _own_statistics(spec, path, data))
+
+
+def _own_statistics(spec: TrainSpec, path: Path, data: Mapping[str, Any]) -> Path | None:
+    """The VecNormalize statistics of a zip, if its own settings have ``normalize``."""
+    wanted = Wanted(algo=spec.algo, env_id=spec.env_id, typed=spec.gym_packages)
+    return None if _spec_of(path, data, wanted).normalize is None else statistics_of(path)
 
 
 def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorithm:
@@ -352,7 +359,8 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
         # The library chooses the buffer's class by ``n_steps``, and would keep the file's class.
         given = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, **given}
     agent: Any = load(spec, path, env, **given)
-    if (statistics := statistics_of(path)) is not None and agent.get_vec_normalize_env():
+    statistics = _own_statistics(spec, path, zip_data(path))
+    if statistics is not None and agent.get_vec_normalize_env():
         take_statistics(env, statistics)
     buffer = replay_buffer_of(path)
     if buffer is None or not issubclass(load_algorithm(spec.algo), OffPolicyAlgorithm):

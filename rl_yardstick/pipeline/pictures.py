@@ -1,4 +1,4 @@
-"""The pictures of a run; among them a policy and its values on the map of a grid world.
+"""The pictures of a run: its learning curve, and a policy with its values on a grid world's map.
 
 On maps, columns are on the horizontal axis, rows on the vertical one, downwards; the centre of a
 cell has integer coordinates. ``cell`` is the width of a cell in points.
@@ -6,27 +6,24 @@ cell has integer coordinates. ``cell`` is the width of a cell in points.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from rl_yardstick.envs.drawing import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, SHELF, WHITE, Colour
 from rl_yardstick.envs.drawing import ORANGE as AMBER
 from rl_yardstick.envs.layout import GOAL, PRIZE, START, TRAP, WALL, GridLayout
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.pipeline.curve_pictures import (
-    ORANGE,
-    draw_diagnosis,
-    draw_learning_curve,
-    draw_pulls,
-    fix_layout,
-    write_png,
-)
 from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMap, value_map
+from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+from rl_yardstick.pipeline.files import replacing
+from rl_yardstick.safe_files.files import NO_LIMIT, content_of
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -41,23 +38,124 @@ def draw(folder: Path, parts: Any) -> None:
     if not spec.pictures:
         return
     with parts.run.console.status("drawing the pictures"):
-        has_pulls = parts.pulls is not None and parts.pulls.n_calls > 0
-        if has_pulls:
-            draw_pulls(folder / "pulls.png", spec.title, parts.pulls.arrays())
-        if not has_pulls or evaluation.evaluations_timesteps:
-            first_step, scale = agent._num_timesteps_at_start, parts.judge.yardstick
-            changed = bool(training_changes(spec))
+        if parts.pulled is None or evaluation.evaluations_timesteps:
+            scale = None if parts.final is None else parts.final.yardstick
             means = [float(np.mean(row)) for row in evaluation.evaluations_results]
             evaluations = dict(zip(evaluation.evaluations_timesteps, means, strict=True))
-            draw_learning_curve(
-                folder, spec.title, evaluations, first_step, scale, on_variant=changed
-            )
+            places = folder, spec.title, evaluations, agent._num_timesteps_at_start, scale
+            draw_learning_curve(*places, on_variant=bool(training_changes(spec)))
         if evaluation.value_maps is not None and evaluation.is_asked_for:
             found = value_map(evaluation.value_maps.evaluator, agent)
             if found is not None:
                 draw_value_map(folder / "value_map.png", spec.title, found)
-        if evaluation.critics is not None:
-            draw_diagnosis(folder, spec.title)
+
+
+# --- learning curves ------------------------------------------------------------------------------
+
+
+def fix_layout(figure: Figure) -> None:
+    """Compute the layout now; artists that are added later do not change it."""
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+
+
+def write_png(figure: Figure, path: Path) -> None:
+    """Write a figure with its layout fixed; `Figure.savefig` would draw everything twice."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    fix_layout(figure)
+    canvas: Any = FigureCanvasAgg(figure)
+    with replacing(path) as beside:
+        canvas.print_png(beside)
+
+
+# Okabe and Ito's colours, which colour-blind readers can distinguish.
+BLUE = "#0072B2"
+ORANGE = "#D55E00"
+OPTIMAL = "#009E73"
+GREY = "#9A9A9A"
+
+MOVING_AVERAGE_EPISODES = 100
+MAX_POINTS = 5000
+
+
+def read_monitors(folder: Path) -> tuple[Floats, Floats]:
+    """For each training episode, its last step counted over all environments, and its return."""
+    contents = [content_of(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
+    rows = [
+        np.loadtxt(BytesIO(content), delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
+        for content in contents
+        if content.count(b"\n") > 2
+    ]
+    if not rows:
+        return np.empty(0), np.empty(0)
+    # The environments step together, so all have done the same number of steps.
+    steps = np.concatenate([len(contents) * np.cumsum(table[:, 1]) for table in rows])
+    returns = np.concatenate([table[:, 0] for table in rows])
+    order = np.argsort(steps, kind="stable")
+    return steps[order], returns[order]
+
+
+def draw_learning_curve(
+    folder: Path,
+    title: str,
+    evaluations: Mapping[int, float],
+    first_step: int,
+    yardstick: Yardstick | None,
+    *,
+    on_variant: bool,
+) -> None:
+    """Draw training returns, from ``first_step`` on, and evaluations by steps into a folder."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
+
+    figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
+    steps, returns = read_monitors(folder)
+    # Returns of a variant of the environment have a scale of their own.
+    apart = on_variant and len(steps) > 0 and (len(evaluations) > 0 or yardstick is not None)
+    ratios = (3, 2) if apart else (1,)
+    panels = figure.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)
+    judged, trained = panels[0, 0], panels[-1, 0]
+    judged.set_ylabel("return of an episode")
+    trained.set_xlabel("environment steps")
+    if apart:
+        trained.set_ylabel("training return")
+        trained.set_title("training, on a variant of the environment", loc="left", fontsize=10)
+    if len(steps):
+        what = "training on a variant" if on_variant and not apart else "training"
+        _draw_training(trained, steps + first_step, returns, what)
+    if evaluations:
+        style: Any = {"color": BLUE, "markersize": 4, "label": "evaluation, mean return"}
+        judged.plot(list(evaluations), list(evaluations.values()), "o-", **style)
+    if yardstick is not None:
+        most = "optimum, at most" if yardstick.is_proven else "optimum, at most (not proven)"
+        ends: dict[str, tuple[float | None, str]] = {
+            "optimum" if yardstick.at_least is None else most: (yardstick.optimum, "-"),
+            "optimum, at least": (yardstick.at_least, "--"),
+            "best random or constant policy": (yardstick.baseline, ":"),
+        }
+        for label, (height, dash) in ends.items():
+            if height is not None:
+                judged.axhline(height, color=OPTIMAL, linestyle=dash, linewidth=1.2, label=label)
+    judged.set_title(title, loc="left")
+    for axes in panels.flat:
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    # Below the axes, where the legend covers no points.
+    figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9, markerscale=2)
+    write_png(figure, folder / "learning_curve.png")
+
+
+def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> None:
+    stride = max(len(steps) // MAX_POINTS, 1)
+    label = f"{what}, " + ("each episode" if stride == 1 else f"1 episode in {stride}")
+    style: Any = {"color": GREY, "markersize": 3, "markeredgewidth": 0, "label": label}
+    axes.plot(steps[::stride], returns[::stride], "o", **style)
+    if (width := min(MOVING_AVERAGE_EPISODES, len(returns))) > 1:
+        smooth = pd.Series(returns).rolling(width, min_periods=1).mean()[::stride]
+        axes.plot(steps[::stride], smooth, color=ORANGE, label=f"{what}, mean of {width} episodes")
 
 
 # --- maps -----------------------------------------------------------------------------------------
@@ -102,16 +200,14 @@ class Policy:
         return columns, rows
 
 
-def policies_in(found: ValueMap, layer: int) -> list[Policy]:
-    """The agent's policy and the optimal ones in one layer."""
-    here, common = found.layout.layers == layer, (found.matters, found.differs)
-    taken = np.eye(len(found.layout.moves), dtype=np.bool_)[found.actions]
-    agent = found.visited, found.values, taken
-    best = found.optimal_visited, found.optimal_values, found.optimal_actions
-    return [
-        Policy(found.layout, layer, *(array[here] for array in (*common, *which)))
-        for which in (agent, best)
-    ]
+def policy_in(found: ValueMap, layer: int, is_best: bool) -> Policy:
+    """The agent's policy, or the optimal ones, in one layer."""
+    which = found.optimal_visited, found.optimal_values, found.optimal_actions
+    if not is_best:
+        taken = np.eye(len(found.layout.moves), dtype=np.bool_)[found.actions]
+        which = found.visited, found.values, taken
+    arrays, here = (found.matters, found.differs, *which), found.layout.layers == layer
+    return Policy(found.layout, layer, *(array[here] for array in arrays))
 
 
 def draw_ground(axes: Axes, policy: Policy, scale: Normalize, colours: Colormap) -> None:
@@ -206,12 +302,6 @@ def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
     axes.add_collection(LineCollection(frames, joinstyle="miter", zorder=4, **style))
 
 
-def return_number(value: float) -> str:
-    """A return with four significant digits, as in the tables of a study."""
-    text = f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.0f}"
-    return text.replace("-", "\N{MINUS SIGN}")
-
-
 # --- whole pictures: two maps side by side --------------------------------------------------------
 
 # Pale enough for dark arrows and numbers; darker means better, also in print and without colours.
@@ -229,7 +319,7 @@ class Side(NamedTuple):
 
     title: str
     shown: ValueMap
-    which: int  # 0 for the agent's policy, 1 for the optimal ones
+    is_best: bool  # whether it shows the optimal policies, not the agent's
     scale: Normalize
     colours: Colormap
     decimals: int
@@ -239,7 +329,7 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
     """Draw a map into a PNG file; colours are exact values, scaled by the optimal ones."""
     agent = _agents_side(found)
     best = f"optimum, all best actions: return {_at_start(found, found.optimal_values)}"
-    sides = agent, agent._replace(title=best, which=1)
+    sides = agent, agent._replace(title=best, is_best=True)
     _draw(path, title, sides, agent, "expected return from here on")
 
 
@@ -252,7 +342,7 @@ def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> No
     costs = replace(found, values=shares, matters=found.visited & (shares >= LEAST_SHARE))
     told = f"loss of its actions: {losses.sum():,.4g} in total"
     scale = 0.0, max(float(shares.max()), 1e-12)
-    cost = Side(told, costs, 0, *_scaled(scale, COST_COLOURS), 0)
+    cost = Side(told, costs, False, *_scaled(scale, COST_COLOURS), 0)
     bar = "share of the gap lost there, in per cent"
     _draw(path, title, (_agents_side(found), cost), cost, bar)
 
@@ -262,11 +352,14 @@ def _agents_side(found: ValueMap) -> Side:
     low, high = float(best.min()), float(best.max())
     colours = _scaled((low, high if high > low else low + 1), VALUE_COLOURS)
     title = f"agent: return {_at_start(found, found.values)}"
-    return Side(title, found, 0, *colours, decimals_for(found))
+    return Side(title, found, False, *colours, decimals_for(found))
 
 
 def _at_start(found: ValueMap, values: Floats) -> str:
-    return return_number(float(found.initial @ values))
+    """The return from the start with four significant digits, as in the tables of a study."""
+    value = float(found.initial @ values)
+    text = f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.0f}"
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def _scaled(ends: tuple[float, float], names: tuple[str, ...]) -> tuple[Normalize, Colormap]:
@@ -304,11 +397,11 @@ def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar
     fix_layout(figure)  # artists inside the panels need no margin
     for pair, layer in zip(pairs, layers, strict=True):
         for axes, side in zip(pair, sides, strict=True):
-            policy = policies_in(side.shown, layer)[side.which]
+            policy = policy_in(side.shown, layer, side.is_best)
             draw_ground(axes, policy, side.scale, side.colours)
             draw_marks(axes, policy, cell)
             font = min(0.2 * cell, 9.0)
-            width = min(2.9 / cell, 0.085) * (0.5 if side.which else 1)
+            width = min(2.9 / cell, 0.085) * (0.5 if side.is_best else 1)
             draw_arrows(axes, policy, width, with_numbers=font >= SMALLEST_FONT)
             if font >= SMALLEST_FONT:
                 draw_numbers(axes, policy, font, side.decimals)

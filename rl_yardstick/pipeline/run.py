@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import platform
@@ -16,10 +17,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Self
 
+import numpy as np
 from filelock import FileLock, Timeout
 from pydantic import ValidationError
 from rich.console import Console
 
+from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import Stopped, UserError
 from rl_yardstick.pipeline.files import read_json, replacing, write_json, write_text
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -151,8 +154,8 @@ class Run:
         write_json(self.path / RECORD, {**known, **facts, **figures})
 
 
-def save_agent(agent: Any, path: Path) -> None:
-    """Save an agent's zip whole or not at all, and the statistics of its VecNormalize."""
+def save_agent(agent: Any, path: Path, buffer: Path | None = None) -> None:
+    """Save an agent's zip whole or not at all, its VecNormalize's statistics and replay buffer."""
     from rl_yardstick.pipeline.finite_numbers import check_model
 
     check_model(agent)
@@ -161,6 +164,9 @@ def save_agent(agent: Any, path: Path) -> None:
     if (statistics := agent.get_vec_normalize_env()) is not None:
         with replacing(statistics_beside(path)) as beside:
             statistics.save(str(beside))
+    if buffer is not None and getattr(agent, "replay_buffer", None) is not None:
+        with replacing(buffer) as beside:
+            agent.save_replay_buffer(beside)
 
 
 def statistics_beside(model: Path) -> Path:
@@ -210,3 +216,30 @@ def machine() -> dict[str, str]:
     processor = named[1].strip() if named else platform.processor() or platform.machine()
     system = f"{platform.system()} {platform.release()}, {platform.machine()}"
     return {"processor": processor, "cores": str(os.cpu_count() or ""), "system": system}
+
+
+# --- the comparisons of ``--diagnose`` ------------------------------------------------------------
+
+# The columns of ``diagnosis.csv`` after the first, in their order.
+MEANINGS = {
+    "v_error": "error of V, RMS over states",
+    "v_error_visited": "error of V, RMS over visits",
+    "q_error": "error of Q, RMS over states",
+    "q_error_visited": "error of Q, RMS over visits",
+    "advantage_error": "error of advantages, RMS over states",
+    "advantage_error_visited": "error of advantages, RMS over visits",
+    "overestimation": "max Q less true value, mean over visits",
+    "entropy": "entropy of the policy, nats, mean over visits",
+    "gae_bias": "GAE: bias between actions, RMS",
+    "gae_offset": "GAE: bias of the state, RMS",
+    "gae_std": "GAE: standard deviation",
+    "gradient_cosine": "gradient: cosine with the exact one",
+    "gradient_snr": "gradient: signal-to-noise ratio",
+}
+
+
+def read_diagnosis(content: bytes) -> dict[str, Floats]:
+    """The columns of a ``diagnosis.csv``, NaN for empty cells."""
+    names, *rows = csv.reader(content.decode().splitlines())
+    table = [[float(cell or "nan") for cell in row] for row in rows]
+    return dict(zip(names, np.array(table).T, strict=True))

@@ -21,15 +21,7 @@ from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.machine_code.compiling import compile_timer
-from rl_yardstick.pipeline.callbacks import (
-    Checkpoint,
-    EvaluationCallback,
-    ProgressCallback,
-    PullRecorder,
-    PullSummary,
-    StateCallback,
-    evaluation_frequencies,
-)
+from rl_yardstick.pipeline import callbacks
 from rl_yardstick.pipeline.components import action_noise, build, constructor_arguments
 from rl_yardstick.pipeline.environments import first_seed, make_training_env, training_changes
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line
@@ -38,7 +30,6 @@ from rl_yardstick.pipeline.evaluation.critics import recorder_of
 from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
-from rl_yardstick.pipeline.files import replacing
 from rl_yardstick.pipeline.finite_numbers import NumberWatch, check_model
 from rl_yardstick.pipeline.models import REPLAY_BUFFER, begun_with, load_to_train
 from rl_yardstick.pipeline.pictures import draw
@@ -107,7 +98,7 @@ class Training:
     """
 
     final: Evaluation | None = None  #: of the agent at the end; None if there are no evaluations
-    pulled: PullSummary | None = None  #: of a training on a bandit
+    pulled: callbacks.PullSummary | None = None  #: of a training on a bandit
     advice: Advice | None = None  #: on an agent that has failed
     engine: str | None = None  #: whether it was compiled, and if not, why; None if unknown
     evaluation_steps = 0  #: environment steps of sampled evaluations
@@ -115,10 +106,10 @@ class Training:
     def __init__(self, spec: TrainSpec, run: Run, agent: BaseAlgorithm, resumes: bool) -> None:
         self.spec, self.run, self.agent = spec, run, agent
         is_bandit = agent.env is not None and agent.env.has_attr("n_arms")
-        self.judge = Judge(spec, agent, run.console)
-        exact = self.judge.exact
+        self.judge = judge = Judge(spec, agent, run.console)
+        exact = judge.exact
         self.can_be_explained = exact is not None  # its gap can be split into parts
-        frequencies = evaluation_frequencies(spec, agent, is_bandit and exact is None)
+        frequencies = callbacks.evaluation_frequencies(spec, agent, is_bandit and exact is None)
         critics = None
         if spec.diagnose:
             is_evaluated = max(frequencies) > 0
@@ -129,16 +120,16 @@ class Training:
         maps = None
         if exact is not None and (spec.watch_learning or exact.layout is not None):
             maps = ValueMapRecorder(run.path / "value_maps.npz", exact)
-        evaluator, eval_env = self.judge.evaluator, self.judge.env
-        self.evaluation = EvaluationCallback(run, eval_env, evaluator, frequencies, maps, critics)
+        self.evaluation = callbacks.EvaluationCallback(run, judge, frequencies, maps, critics)
         recorder = watch_of(spec, agent, maps)
-        self.watch: Watch | None = recorder  # what a page plays of the training
-        self.pulls = PullRecorder(run.path) if is_bandit else None
+        # What a page plays of the training.
+        self.watch: Watch | None = recorder or (maps if spec.watch_learning else None)
+        self.pulls = callbacks.PullRecorder(run.path) if is_bandit else None
         if is_bandit and getattr(agent, "engine", None) == "compiled":  # it stops at no pull
             self.pulls, note = None, "engine: compiled keeps no pulls, so regret is not known"
             run.console.print(note, style="dim")
         on_variant = bool(training_changes(spec))
-        self.progress = ProgressCallback(run.console, spec.total_timesteps, on_variant)
+        self.progress = callbacks.ProgressCallback(run.console, spec.total_timesteps, on_variant)
         self.callback = self._callbacks(resumes, recorder)
 
     def _callbacks(self, resumes: bool, recorder: TableRecorder | None) -> CallbackList:
@@ -148,7 +139,6 @@ class Training:
         other callback acts.
         """
         spec, folder = self.spec, self.run.path
-        every, every_n_episodes = spec.save_freq, spec.save_every_n_episodes
         schedules = [getattr(self.agent, name, None) for name in ("lr_schedule", "clip_range")]
         runs_by_steps = any(callable(s) and s(1.0) != s(0.0) for s in schedules)
         if spec.n_episodes and isinstance(self.agent, OnPolicyAlgorithm) and runs_by_steps:
@@ -156,21 +146,19 @@ class Training:
                 f"the schedules of {spec.algo} run by steps: give n_timesteps instead of "
                 "n_episodes, or constant values"
             )
-        checkpoint: dict[str, Any] = {
-            "save_path": str(folder),
-            "with_replay_buffer": spec.save_replay_buffer,
-        }
+        every, every_episodes = spec.save_freq, spec.save_every_n_episodes
+        where = str(folder), spec.save_replay_buffer
         given, typed = spec.callback, spec.gym_packages
         possible: list[BaseCallback | None] = [
             *(build(one, BaseCallback, "callback", typed, folder) for one in given),
-            Checkpoint(every, **checkpoint) if every > 0 else None,
-            Checkpoint(None, every_n_episodes, **checkpoint) if every_n_episodes > 0 else None,
+            callbacks.Checkpoint(every, 0, *where) if every > 0 else None,
+            callbacks.Checkpoint(None, every_episodes, *where) if every_episodes > 0 else None,
             *(self.pulls, self.evaluation.critics, recorder, self.evaluation),
             EpisodeBudget(spec.n_episodes) if spec.n_episodes is not None else None,
             self.progress,
         ]
         others = [callback for callback in possible if callback is not None]
-        saver = StateCallback(self.run, resumes, self.judge, others, self.progress)
+        saver = callbacks.StateCallback(self.run, resumes, self.judge, others, self.progress)
         return CallbackList([NumberWatch(), saver, *others])
 
     def learn(self) -> None:
@@ -202,11 +190,8 @@ class Training:
 
     def save(self) -> None:
         """Save the agent at the end, and its replay buffer if that is asked for."""
-        save_agent(self.agent, self.run.model_path(self.spec))
-        agent: Any = self.agent
-        if self.spec.save_replay_buffer and getattr(agent, "replay_buffer", None) is not None:
-            with replacing(self.run.path / REPLAY_BUFFER) as beside:
-                agent.save_replay_buffer(beside)
+        buffer = self.run.path / REPLAY_BUFFER if self.spec.save_replay_buffer else None
+        save_agent(self.agent, self.run.model_path(self.spec), buffer)
 
     def judge_the_end(self) -> None:
         """Do missing evaluations and the final one."""
@@ -223,7 +208,7 @@ class Training:
                 evaluation.critics.finish(agent.num_timesteps)
             evaluation.take_statistics()
             begun, evaluator = WorkTime.now(), evaluation.evaluator
-            self.final = self.judge.at_the_end(agent)
+            self.final = evaluator.at_the_end(agent)
             evaluation.taken += WorkTime.now() - begun
             if not self.run.console.quiet:
                 self.advice = advice(self.spec, agent, evaluator, self.final, agent.num_timesteps)

@@ -15,11 +15,7 @@ from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.evaluation.value_maps import (
-    MAX_STATES,
-    ValueMapRecorder,
-    best_actions_of,
-)
+from rl_yardstick.pipeline.evaluation import value_maps
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # Limits for a page of three megabytes.
@@ -176,11 +172,11 @@ def has_actions(agent: BaseAlgorithm, table: Floats) -> bool:
     return table.ndim > 1 and table.shape[-1] == actions.n and table.shape[-2] in (states.n, 1)
 
 
-Watch = TableRecorder | ValueMapRecorder
+Watch = TableRecorder | value_maps.ValueMapRecorder
 
 
 def watch_of(
-    spec: TrainSpec, agent: BaseAlgorithm, maps: ValueMapRecorder | None
+    spec: TrainSpec, agent: BaseAlgorithm, maps: value_maps.ValueMapRecorder | None
 ) -> TableRecorder | None:
     """The recorder of an untrained agent with tables; None if none is asked for, and for maps."""
     if spec.watch_learning is None:
@@ -193,8 +189,8 @@ def watch_of(
                 f"{spec.algo} on {spec.env_id} have {n_entries:,}"
             )
         return TableRecorder(spec.watch_episodes)
-    is_small = maps is not None and maps.evaluator.model.n_states <= MAX_STATES
-    if maps is None or not is_small or best_actions_of(maps.evaluator, agent) is None:
+    is_small = maps is not None and maps.evaluator.model.n_states <= value_maps.MAX_STATES
+    if maps is None or not is_small or value_maps.best_actions_of(maps.evaluator, agent) is None:
         raise UserError(
             f"--watch-learning shows tables, or an agent's actions in up to 2,500 known states: "
             f"{spec.algo} on {spec.env_id} has neither"

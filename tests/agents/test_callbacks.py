@@ -4,6 +4,7 @@ import csv
 import json
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -76,7 +77,7 @@ def trained(engine, folder):
         sb3.CheckpointCallback(110, str(folder), name_prefix="library"),
         sb3.EveryNTimesteps(70, recorder := Recorder()),
         sb3.LogEveryNTimesteps(130),
-        EvaluationCallback(run, env, evaluator, (55, 0)),
+        EvaluationCallback(run, SimpleNamespace(env=env, evaluator=evaluator), (55, 0)),
         Checkpoint(85, **steps),
         Checkpoint(every_n_episodes=9, **episodes),
         bar := sb3.ProgressBarCallback(),

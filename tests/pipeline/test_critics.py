@@ -22,7 +22,7 @@ from rl_yardstick.pipeline.evaluation.critics import (
     minibatches,
     recorder_of,
 )
-from rl_yardstick.pipeline.evaluation.policies import policy_matrix
+from rl_yardstick.pipeline.evaluation.policies import own_values, policy_matrix
 from tests.envs.corridors import Corridor
 from tests.pipeline.short_runs import LAKE, agent_of, run_of, spec_of
 from tests.pipeline.test_resuming import content
@@ -140,7 +140,7 @@ def test_estimates_of_rollouts_are_compared_with_what_is_expected_of_them(corrid
     found = recorder.rollout_figures(0)
     states = buffer.observations.reshape(-1).astype(int)
     actions = buffer.actions.reshape(-1).astype(int)
-    policy, critic = recorder.policy(), critics.own_values(agent, world.observations)
+    policy, critic = recorder.policy(), own_values(agent, world.observations)
     advantages = world.values(policy, 0.9).advantages[states, actions]
     steps = states, actions, steps_left(buffer.episode_starts, 50).reshape(-1)
     expected, shared = expected_estimates(world.model, policy, critic, 0.9, 0.7, steps)

@@ -108,6 +108,14 @@ def test_statistics_go_on_unless_the_new_entry_has_none(normalised, tmp_path):
     # Where the entry has nothing, the agent's own settings count.
     assert read(run.path / CART / "vecnormalize.pkl").clip_obs == 3.0
     assert run.spec().normalize["clip_obs"] == 3.0
+    # Statistics beside an agent that was trained without any are another's.
+    plain = train_to(tmp_path / "plain", "a2c", SMALL_A2C, 40, eval_freq=-1)
+    saved = run.path / CART / "vecnormalize.pkl"
+    (plain.path / "vecnormalize.pkl").write_bytes(saved.read_bytes())
+    fields["trained_agent"] = str(model_in(plain.path))
+    assert train_to(tmp_path / "off", "a2c", SMALL_A2C, 40, **fields).spec().normalize is None
+    run = train_to(tmp_path / "new", "a2c", {**SMALL_A2C, "normalize": {}}, 40, **fields)
+    assert seen(run.path / CART / "vecnormalize.pkl") == 42
 
 
 def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tmp_path):

@@ -11,11 +11,11 @@ import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.pipeline import callbacks, watching
 from rl_yardstick.pipeline.callbacks import ProgressCallback
-from rl_yardstick.pipeline.curve_pictures import read_monitors
 from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.value_maps import value_map
+from rl_yardstick.pipeline.pictures import read_monitors
 from rl_yardstick.pipeline.watching import TERMINATED, TableRecorder
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, run_of, spec_of, trained
 from tests.pipeline.test_resuming import content

@@ -24,27 +24,15 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from rl_yardstick.agents.common.callbacks import BlockCallback
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
 from rl_yardstick.agents.planning import PlanningAgent
-from rl_yardstick.envs.known_models import (
-    action_masks_of_states,
-    observations_of_states,
-    time_limit,
-    transition_model,
-)
+from rl_yardstick.envs import known_models
 from rl_yardstick.mdp import TransitionModel, state_visitation
 from rl_yardstick.mdp.gaps import PolicyValues, discounted_values, expected_estimates
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.pipeline.curve_pictures import MEANINGS
 from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.evaluation import policies
 from rl_yardstick.pipeline.evaluation.exact import is_wrapped_as_vector
-from rl_yardstick.pipeline.evaluation.policies import (
-    OfLastPolicy,
-    best_actions,
-    obstacle,
-    own_values,
-    policy_matrix,
-    takes_masks,
-)
 from rl_yardstick.pipeline.files import write_text
+from rl_yardstick.pipeline.run import MEANINGS
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # Agents that always learn the values of their exploring policy.
@@ -69,7 +57,7 @@ class KnownWorld:
     is_limited: bool = True  # whether ``horizon`` limits training; else only evaluations
 
     @cached_property
-    def visits(self) -> OfLastPolicy[Floats]:
+    def visits(self) -> policies.OfLastPolicy[Floats]:
         """The function from a policy (S, A) to the share of its steps in each state, shape (S,)."""
 
         def shares(policy: Floats) -> Floats:
@@ -78,15 +66,15 @@ class KnownWorld:
             visits = state_visitation(self.model, given, self.horizon)
             return np.asarray(visits / visits.sum())
 
-        return OfLastPolicy(shares)
+        return policies.OfLastPolicy(shares)
 
     @cached_property
-    def _values(self) -> dict[float, OfLastPolicy[PolicyValues]]:
+    def _values(self) -> dict[float, policies.OfLastPolicy[PolicyValues]]:
         return {}
 
     def values(self, policy: Floats, discount: float) -> PolicyValues:
         """The exact values of a policy (S, A)."""
-        new = OfLastPolicy(lambda asked: discounted_values(self.model, asked, discount))
+        new = policies.OfLastPolicy(lambda asked: discounted_values(self.model, asked, discount))
         return self._values.setdefault(discount, new)(policy)
 
     @cached_property
@@ -110,23 +98,23 @@ def known_world(spec: TrainSpec, agent: BaseAlgorithm) -> KnownWorld | str:
     if is_wrapped_as_vector(spec):
         return "a VecEnv wrapper changes what the agent sees"
     with closing(make_single_env(spec, training=True)) as env:
-        model, horizon, observations = transition_model(env), time_limit(env), None
-        if model is not None:
-            observations, masks = observations_of_states(env), action_masks_of_states(env)
+        model, horizon = known_models.transition_model(env), known_models.time_limit(env)
+        observations = None if model is None else known_models.observations_of_states(env)
+        masks = None if observations is None else known_models.action_masks_of_states(env)
     if model is None or observations is None:
         return f"the exact model of {spec.env_id} is not known"
     is_limited = horizon is not None
     if horizon is None:
         with closing(make_single_env(spec)) as env:
-            horizon = time_limit(env)
+            horizon = known_models.time_limit(env)
         assert horizon is not None
     if model.prob.size > MOST_OUTCOMES:
         return f"{spec.env_id} has {model.prob.size:,} outcomes, which are too many"
-    if reason := obstacle(agent, observations, masks, horizon, deterministic=False):
+    if reason := policies.obstacle(agent, observations, masks, horizon, deterministic=False):
         return reason
-    if own_values(agent, observations) is None:
+    if policies.own_values(agent, observations) is None:
         return f"{spec.algo} has no values"
-    masks = masks if takes_masks(agent) else None
+    masks = masks if policies.takes_masks(agent) else None
     world = KnownWorld(model, observations, horizon, masks, is_limited)
     # Compiled functions are loaded before the training begins.
     first = np.eye(model.n_actions)[np.zeros(model.n_states, np.int64)]
@@ -147,7 +135,7 @@ def recorder_of(
     explores = learns_exploring_values(spec, agent) or isinstance(agent, SoftmaxAlgorithm)
     if not isinstance(agent, OnPolicyAlgorithm):
         return CriticRecorder(path, world, explores=explores)
-    has_rollouts = type(agent.rollout_buffer) is RolloutBuffer or takes_masks(agent)
+    has_rollouts = type(agent.rollout_buffer) is RolloutBuffer or policies.takes_masks(agent)
     has_rollouts &= len(world.numbers) == world.model.n_states  # observations tell states apart
     return (RolloutRecorder if has_rollouts else CriticRecorder)(path, world, explores=True)
 
@@ -197,17 +185,17 @@ class CriticRecorder(BlockCallback):
         """The target policy of the agent's values, as probabilities of shape (S, A)."""
         world, agent = self.world, self.model
         if self.explores:
-            found = policy_matrix(agent, world.observations, deterministic=False, masks=world.masks)
+            found = policies.policy_matrix(agent, world.observations, False, world.masks)
             # Probabilities in float32 do not sum to exactly 1.
             return np.asarray(found / found.sum(axis=1, keepdims=True))
-        actions = best_actions(agent, world.observations, world.masks)
+        actions = policies.best_actions(agent, world.observations, world.masks)
         return np.eye(world.model.n_actions)[actions]
 
     def figures(self) -> dict[str, float]:
         """The columns for the current agent."""
         world, policy = self.world, self.policy()
         exact = world.values(policy, float(self.model.gamma))  # type: ignore[attr-defined]
-        believed, visits = own_values(self.model, world.observations), world.visits(policy)
+        believed, visits = policies.own_values(self.model, world.observations), world.visits(policy)
         assert believed is not None
         reachable = world.model.reachable
         allowed = np.broadcast_to(reachable[:, None], policy.shape)
@@ -277,7 +265,7 @@ class RolloutRecorder(CriticRecorder):
         states = world.states_of(buffer.observations, n_steps * n_envs)
         actions = buffer.actions.reshape(-1).astype(np.int64)
         estimates = buffer.advantages.reshape(-1).astype(np.float64)
-        policy, critic = self.policy(), own_values(agent, world.observations)
+        policy, critic = self.policy(), policies.own_values(agent, world.observations)
         exact = world.values(policy, float(agent.gamma))
         times = np.arange(n_steps)[:, None]
         begun = np.maximum.accumulate(np.where(buffer.episode_starts > 0, times, 0))

@@ -22,36 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from rl_yardstick import mdp
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
-from rl_yardstick.envs.known_models import (
-    action_masks_of_states,
-    model_check,
-    observations_of_states,
-    success_outcomes,
-    time_limit,
-    transition_model,
-)
+from rl_yardstick.envs import known_models
 from rl_yardstick.envs.layout import GridLayout, grid_layout
-from rl_yardstick.mdp import (
-    TransitionModel,
-    baseline_return,
-    finite_horizon_optimum,
-    optimal_choices,
-    optimum_far_from_limit,
-    policy_return,
-    state_values,
-)
 from rl_yardstick.mdp.beliefs import Bracket, memory_optimum
 from rl_yardstick.mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats
 from rl_yardstick.pipeline.environments import evaluation_kwargs, make_single_env
-from rl_yardstick.pipeline.evaluation.policies import (
-    OfLastPolicy,
-    acts_by,
-    best_actions,
-    obstacle,
-    policy_matrix,
-)
+from rl_yardstick.pipeline.evaluation import policies
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
 from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -102,7 +81,7 @@ class HiddenScale:
 
 
 def hidden_scale(
-    model: TransitionModel,
+    model: mdp.TransitionModel,
     observations: NDArray[np.generic],
     horizon: int,
     full_optimum: float,
@@ -132,7 +111,7 @@ def hidden_scale(
 class ExactEvaluator:
     """Evaluates agents on an environment whose model is known."""
 
-    model: TransitionModel  #: dynamics of the evaluation environment
+    model: mdp.TransitionModel  #: dynamics of the evaluation environment
     observations: NDArray[Any]  #: of each state, states along the first axis
     horizon: int  #: the time limit
     success: Bools | None  #: the outcomes that count as success, shape (S, A, K), or None
@@ -160,11 +139,11 @@ class ExactEvaluator:
         with suppress(TypeError, ValueError):  # an agent's probabilities may not be known
             policy = self.policy(agent, deterministic=False)
             # The mean alone takes a fifth of the time that `policy_return` takes.
-            values = state_values(self.model, policy, self.horizon)
-            found = OtherReturns(acts_by(agent), float(self.model.initial @ values))
+            values = mdp.state_values(self.model, policy, self.horizon)
+            found = OtherReturns(policies.acts_by(agent), float(self.model.initial @ values))
         if isinstance(discount, int | float) and 0 <= discount <= 1:
             greedy = self.policy(agent, deterministic=True)
-            worth = policy_return(self.model, greedy, self.horizon, discount).expected_return
+            worth = mdp.policy_return(self.model, greedy, self.horizon, discount).expected_return
             optimum = self._optimum_under(discount) if self.scale is None else None
             found = replace(
                 found, discount=discount, discounted_return=worth, discounted_optimum=optimum
@@ -174,28 +153,28 @@ class ExactEvaluator:
     @cached_property
     def _optimum_under(self) -> Callable[[float], float]:
         """The function from a discount to the optimum of agents that see the state."""
-        return cache(lambda d: finite_horizon_optimum(self.model, self.horizon, d).start_value)
+        return cache(lambda d: mdp.finite_horizon_optimum(self.model, self.horizon, d).start_value)
 
     @cached_property
-    def _worth(self) -> OfLastPolicy[Evaluation]:
+    def _worth(self) -> policies.OfLastPolicy[Evaluation]:
         def worth(policy: NDArray[Any]) -> Evaluation:
-            found = policy_return(self.model, policy, self.horizon, success=self.success)
+            found = mdp.policy_return(self.model, policy, self.horizon, success=self.success)
             rate, std = found.success_rate, float(np.sqrt(found.return_variance))
             returns, lengths = np.array([found.expected_return]), np.array([found.expected_length])
             successes = None if rate is None else np.array([rate])
             return Evaluation(returns, lengths, successes, std, self.yardstick)
 
-        return OfLastPolicy(worth)
+        return policies.OfLastPolicy(worth)
 
     @cached_property
-    def values(self) -> OfLastPolicy[Floats]:
+    def values(self) -> policies.OfLastPolicy[Floats]:
         """The function from a policy to its state values, shape (S,); see `state_values`."""
-        return OfLastPolicy(lambda policy: state_values(self.model, policy, self.horizon))
+        return policies.OfLastPolicy(lambda p: mdp.state_values(self.model, p, self.horizon))
 
     @cached_property
     def optimum(self) -> tuple[Floats, Bools]:
         """The optimal state values, shape (S,), and the optimal actions, shape (S, A)."""
-        return optimal_choices(self.model, self.horizon)
+        return mdp.optimal_choices(self.model, self.horizon)
 
     def policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
         """The policy: probabilities (S, A), or actions (S,), or actions by step (horizon, S)."""
@@ -203,12 +182,12 @@ class ExactEvaluator:
             n_steps = 1 if agent.policy.is_stationary else self.horizon
             return agent.policy.actions_after(self.observations[None], np.arange(n_steps)[:, None])
         if deterministic and not isinstance(agent, RandomAgent):
-            return best_actions(agent, self.observations, self.masks)
-        return policy_matrix(agent, self.observations, deterministic, self.masks)
+            return policies.best_actions(agent, self.observations, self.masks)
+        return policies.policy_matrix(agent, self.observations, deterministic, self.masks)
 
     def obstacle(self, agent: BaseAlgorithm, deterministic: bool = True) -> str:
         """Why the policy cannot be computed, or only too slowly; empty if it can."""
-        return obstacle(agent, self.observations, self.masks, self.horizon, deterministic)
+        return policies.obstacle(agent, self.observations, self.masks, self.horizon, deterministic)
 
 
 def is_wrapped_as_vector(spec: TrainSpec) -> bool:
@@ -240,31 +219,32 @@ def evaluator_of_single(spec: TrainSpec) -> ExactEvaluator | None:
 
 def _evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     with closing(make_single_env(spec)) as env:
-        model, horizon, space = transition_model(env), time_limit(env), env.observation_space
+        model, horizon = known_models.transition_model(env), known_models.time_limit(env)
+        space = env.observation_space
         n_bytes = math.prod(space.shape or ()) * np.dtype(space.dtype).itemsize
         if model is None or horizon is None or model.n_states * n_bytes > MOST_BYTES_OBSERVED:
             return None
-        observations = observations_of_states(env)
+        observations = known_models.observations_of_states(env)
         if observations is None or (optimum := _optimum(model, horizon)) is None:
             return None
-        masks = action_masks_of_states(env)
-        success, layout = success_outcomes(env), grid_layout(env)
+        masks = known_models.action_masks_of_states(env)
+        success, layout = known_models.success_outcomes(env), grid_layout(env)
     if layout is not None and layout.n_states != model.n_states:
         layout = None  # the states of a user's grid world are not cells
-    baseline = float(baseline_return(model, horizon))
+    baseline = float(mdp.baseline_return(model, horizon))
     scale = hidden_scale(model, observations, horizon, optimum, baseline)
     yardstick = Yardstick(optimum, baseline) if scale is None else scale.yardstick(False)
     return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks, scale)
 
 
-def _optimum(model: TransitionModel, horizon: int) -> float | None:
+def _optimum(model: mdp.TransitionModel, horizon: int) -> float | None:
     """The highest expected return under the time limit; None if planning takes too long."""
     n_backups = int(model.reachable.sum()) * model.n_actions * model.n_outcomes * horizon
     if n_backups > FEW_BACKUPS:
-        found = optimum_far_from_limit(model, horizon)
+        found = mdp.optimum_far_from_limit(model, horizon)
         if found is not None or n_backups > MOST_BACKUPS:
             return found
-    return finite_horizon_optimum(model, horizon).start_value
+    return mdp.finite_horizon_optimum(model, horizon).start_value
 
 
 def model_refusal(spec: TrainSpec) -> str | None:
@@ -272,5 +252,5 @@ def model_refusal(spec: TrainSpec) -> str | None:
     if is_wrapped_as_vector(spec):
         return None
     with closing(make_single_env(spec)) as env:
-        check = model_check(env)
+        check = known_models.model_check(env)
     return None if check is None else check.refusal

@@ -24,17 +24,12 @@ from rl_yardstick.agents.planning import RandomAgent
 from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Ints
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_single_env, remembers
+from rl_yardstick.pipeline.evaluation import policies
 from rl_yardstick.pipeline.evaluation.exact import (
     ExactEvaluator,
     evaluator_of_single,
     exact_evaluator,
     model_refusal,
-)
-from rl_yardstick.pipeline.evaluation.policies import (
-    has_memory,
-    is_of_library,
-    takes_masks,
-    why_not_exact,
 )
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator, n_environments
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
@@ -48,21 +43,20 @@ class Judge:
         exact: the exact evaluator; None if episodes are sampled or histories followed.
         env: the evaluation environments.
         evaluator: maps the agent to an `Evaluation`.
-        yardstick: that of the final evaluation, once it is done.
         refusal: why the environment's own model was rejected; None if it was not.
     """
 
     def __init__(self, spec: TrainSpec, agent: BaseAlgorithm, console: Console) -> None:
-        exact = None if has_memory(agent) else exact_evaluator(spec)
+        exact = None if policies.has_memory(agent) else exact_evaluator(spec)
         scale, note, n_envs = None, None, 1
         if exact is not None:
             obstacle, note = exact.obstacle(agent), exact.scale and exact.scale.note
-            if reason := obstacle or why_not_exact(agent, exact.observations):
+            if reason := obstacle or policies.why_not_exact(agent, exact.observations):
                 note = f"evaluations are sampled, not exact: {reason}"
                 # A user's agent that cannot be queried in all states may have memory.
                 scale, exact = exact.yardstick if obstacle else _scale_of_memory(exact), None
         world = None if exact is not None else world_of_memory(spec, agent)
-        if exact is None and is_of_library(agent.predict.__module__):
+        if exact is None and policies.is_of_library(agent.predict.__module__):
             n_envs = n_environments(spec.n_eval_envs, spec.eval_episodes)
         self.exact, self.env = exact, make_evaluation_env(spec, n_envs)
         self.evaluator: Any = exact
@@ -73,14 +67,7 @@ class Judge:
             self.evaluator = SampledEvaluator(spec, self.env, scale)
         if note:
             console.print(note, style="dim", markup=False, highlight=False)
-        self.yardstick: Yardstick | None = None
         self.refusal = None if exact is not None else model_refusal(spec)
-
-    def at_the_end(self, agent: BaseAlgorithm) -> Evaluation:
-        """The final evaluation, with more episodes or further exact returns."""
-        found: Evaluation = self.evaluator.at_the_end(agent)
-        self.yardstick = found.yardstick
-        return found
 
 
 # --- histories ------------------------------------------------------------------------------------
@@ -93,8 +80,8 @@ def world_of_memory(spec: TrainSpec, agent: BaseAlgorithm) -> ExactEvaluator | N
     """The exact evaluator of an agent with memory; None if histories cannot be followed."""
     is_covered = spec.normalize is not None or bool(spec.vec_env_wrapper)
     # The memory of other agents has an unknown form, and some sample their actions.
-    is_known = is_of_library(type(agent).__module__) and not isinstance(agent, RandomAgent)
-    if is_covered or not is_known or not (has_memory(agent) or remembers(spec)):
+    is_known = policies.is_of_library(type(agent).__module__) and not isinstance(agent, RandomAgent)
+    if is_covered or not is_known or not (policies.has_memory(agent) or remembers(spec)):
         return None
     return evaluator_of_single(spec)
 
@@ -178,7 +165,7 @@ def by_histories(spec: TrainSpec, agent: BaseAlgorithm, world: ExactEvaluator) -
     model, variance = world.model, world.model.reward_variance
     groups = observation_groups(world.observations, model.reachable)
     groups = np.arange(model.n_states) if groups is None else groups
-    if takes_masks(agent):  # masks reveal more of the state than observations
+    if policies.takes_masks(agent):  # masks reveal more of the state than observations
         return None
     memory = _Memory(agent, spec)
     # Per history and state: the probability p, p x mean return, and p x mean squared return so far.

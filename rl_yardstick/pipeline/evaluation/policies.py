@@ -6,7 +6,7 @@ import inspect
 import sys
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch as th
@@ -277,15 +277,11 @@ def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:
 # --- values or probabilities of actions -----------------------------------------------------------
 
 
-class ActionFigures(NamedTuple):
-    """A number for each action."""
+def action_figures(agent: BaseAlgorithm, observations: Any) -> tuple[str, Floats] | None:
+    """The agent's figures for each action at the observation of one environment, or None.
 
-    word: str  # the kind of numbers: "value", "score" or "probability"
-    numbers: Floats  # shape (A,)
-
-
-def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | None:
-    """The agent's figures for each action at the observation of one environment, or None."""
+    Returns "value", "score" or "probability", and the numbers, shape (A,).
+    """
     policy: Any = agent.policy
     if not isinstance(agent.action_space, spaces.Discrete):
         return None
@@ -293,18 +289,18 @@ def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | N
         table = getattr(policy, name, None)
         if table is not None and isinstance(agent.observation_space, spaces.Discrete):
             row = int(np.asarray(observations).reshape(-1)[0])
-            return ActionFigures(word, np.asarray(table)[row if len(table) > 1 else 0])
+            return word, np.asarray(table)[row if len(table) > 1 else 0]
     if isinstance(agent, SoftmaxAlgorithm):
-        return ActionFigures("probability", agent.action_probabilities(observations)[0])
+        return "probability", agent.action_probabilities(observations)[0]
     # A recurrent policy would need its hidden state.
     if isinstance(policy, ActorCriticPolicy) and not hasattr(policy, "lstm_actor"):
         with th.no_grad():
             distribution = policy.get_distribution(policy.obs_to_tensor(observations)[0])
         if not isinstance(distribution, CategoricalDistribution):
             return None
-        return ActionFigures("probability", distribution.distribution.probs[0].cpu().numpy())
+        return "probability", distribution.distribution.probs[0].cpu().numpy()
     values = own_values(agent, observations)
-    return None if values is None or values.ndim == 1 else ActionFigures("value", values[0])
+    return None if values is None or values.ndim == 1 else ("value", values[0])
 
 
 def own_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:

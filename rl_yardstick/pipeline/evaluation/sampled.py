@@ -11,7 +11,7 @@ import math
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,24 +152,21 @@ def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
     return Yardstick(found.upper, found.baseline, found.lower, found.upper_is_proven)
 
 
-class Shares(NamedTuple):
-    """Evaluation steps per training step."""
-
-    usual: float  # for every training
-    at_first: float  # for short trainings, up to `STEPS_AT_FIRST` evaluation steps
-
+# Evaluation steps per training step: for every training, and for short ones, up to
+# `STEPS_AT_FIRST` evaluation steps.
+Shares = tuple[float, float]
 
 # For networks and for tables, by what is compiled. Chosen by the time of an evaluation step
 # relative to a training step, so that evaluations take at most a fifth of the training time.
 # Figures: docs/benchmarks.md.
 SHARES = {
-    "nothing": (Shares(1 / 4, 1 / 2), Shares(1 / 100, 1 / 5)),
-    "training and evaluation": (Shares(1 / 4, 1 / 2), Shares(1 / 10, 1 / 2)),
-    "training": (Shares(1 / 32, 1 / 32), Shares(1 / 2500, 1 / 2500)),
-    "learning": (Shares(1 / 32, 1 / 6), Shares(1 / 32, 1 / 6)),  # the environments are in Python
+    "nothing": ((1 / 4, 1 / 2), (1 / 100, 1 / 5)),
+    "training and evaluation": ((1 / 4, 1 / 2), (1 / 10, 1 / 2)),
+    "training": ((1 / 32, 1 / 32), (1 / 2500, 1 / 2500)),
+    "learning": ((1 / 32, 1 / 6), (1 / 32, 1 / 6)),  # the environments are in Python
 }
 # A2C learns once from each step, which takes no longer than playing it.
-LIGHT_NETWORK = Shares(1 / 10, 1 / 10)
+LIGHT_NETWORK = (1 / 10, 1 / 10)
 STEPS_AT_FIRST = 10_000
 # A tenth of a second in most environments.
 STEPS_IN_ANY_CASE = 2_000
@@ -186,12 +183,6 @@ def shares_of(model: BaseAlgorithm, *, plays_compiled: bool) -> Shares:
         return LIGHT_NETWORK
     of_network, of_table = SHARES[compiled]
     return of_network if is_network(model) else of_table
-
-
-def allowed_steps(n_trained: float, shares: Shares) -> float:
-    """The number of steps that all evaluations of a training together may take."""
-    at_first = min(shares.at_first * n_trained, STEPS_AT_FIRST)
-    return max(shares.usual * n_trained, at_first, STEPS_IN_ANY_CASE)
 
 
 # Of the allowed steps; the final evaluation gets the rest, but at least the other half.
@@ -278,8 +269,11 @@ class SampledEvaluator:
         return replace(found, yardstick=self.yardstick)
 
     def _allowed(self, model: BaseAlgorithm, n_trained: float) -> float:
+        """The number of steps that all evaluations of a training together may take."""
         is_compiled = self._compiled_copy(model) is not None
-        return allowed_steps(n_trained, shares_of(model, plays_compiled=is_compiled))
+        usual, at_first = shares_of(model, plays_compiled=is_compiled)
+        at_first = min(at_first * n_trained, STEPS_AT_FIRST)
+        return max(usual * n_trained, at_first, STEPS_IN_ANY_CASE)
 
     def _compiled_copy(self, model: BaseAlgorithm) -> CompiledCopy | None:
         """The compiled evaluation environments, if the agent trains in compiled code."""

@@ -19,9 +19,9 @@ from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.pool import do_aside
 from rl_yardstick.experiments.results import read_compared, read_value_maps
-from rl_yardstick.pipeline.curve_pictures import MEANINGS
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.files import read_bytes, read_json
+from rl_yardstick.pipeline.run import MEANINGS
 from rl_yardstick.report.films import films_of, has_film
 from rl_yardstick.report.page.frame import Report, Section, data_uri, first_runs, layout_data
 from rl_yardstick.report.series import (
