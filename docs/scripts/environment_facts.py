@@ -1,15 +1,8 @@
-"""The facts on an environment for its page, computed from its model and its docstring.
-
-``train.py --list`` reads the difficulty of environments from ``envs/hardness.json``. After a change
-of a model, write that file again by this program; else building the pages fails:
-
-    python docs/scripts/environment_facts.py
-"""
+"""The facts on an environment for its page, computed from its model and its docstring."""
 
 from __future__ import annotations
 
 import inspect
-import json
 import re
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,7 +14,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-from rl_yardstick import envs
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs.known_models import (
     observations_of_states,
@@ -47,7 +39,6 @@ HARDNESS_HEADS = (
     *("states", "diameter", "pairs", "smallest gap", "mean gap", "variance", "look-ahead"),
     *("effective horizon", "random actions to a reward", "to the goal"),
 )
-HARDNESS = Path(envs.__file__).with_name("hardness.json")
 LIMIT = 1000  # the commands' time limit for an environment without one
 MOST_REWARDS = 8
 
@@ -128,11 +119,9 @@ def variants_block(*words: str) -> str:
 
 def hardness_block(*ids: str) -> str:
     """A row for each environment: measures of its difficulty, by its model and time limit."""
-    stored = json.loads(HARDNESS.read_text(encoding="utf-8"))
     lines = [f"| id | {' | '.join(HARDNESS_HEADS)} |", f"|---|{'---:|' * len(HARDNESS_HEADS)}"]
     for env_id in ids:
         cells = hardness_cells(env_id)
-        assert stored.get(env_id) == cells, f"{HARDNESS.name} is stale: {env_id}"
         lines.append(f"| `{env_id}` | {' | '.join(cells.values())} |")
     return "\n".join(lines) + "\n"
 
@@ -278,10 +267,3 @@ def docstring_sections(cls: Any) -> list[str]:
     text = re.sub(r"::\n", ":\n", inspect.getdoc(cls) or "")
     lead, *sections = re.split(r"(?m)^(?=## )", text.partition("\n")[2].strip())
     return [part for part in map(str.strip, (lead, *sections)) if part]
-
-
-if __name__ == "__main__":
-    page = (PAGES.parent / "environments.md").read_text(encoding="utf-8")
-    (written,) = re.findall(r'"hardness: ([^"]*)"', page)
-    stored = {env_id: hardness_cells(env_id) for env_id in written.split()}
-    HARDNESS.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")

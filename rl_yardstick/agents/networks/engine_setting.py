@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import statistics
-import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from contextlib import closing
@@ -43,7 +41,6 @@ from rl_yardstick.agents.networks.engine import (
     network_player,
 )
 from rl_yardstick.agents.networks.perceptron import Inputs, one_thread
-from rl_yardstick.machine_code.compiling import folder
 
 # Conditions for compiled trainings of the library's agents.
 
@@ -84,7 +81,7 @@ def _check_spaces(agent: Any) -> None:
 # machine or the cache of compiled code: the two draw different random numbers, so the same settings
 # and the same seed must always choose the same one.
 
-# Processor seconds, measured on one core with one thread; `machine_pace` compares other machines.
+# Processor seconds, measured on one core with one thread.
 # Of the library's loop:
 CALL = 0.3e-3  # choosing actions for all environments, and storing the transitions
 ENV_STEP = 0.05e-3  # a step of one environment in Python, Monitor on
@@ -95,18 +92,12 @@ UPDATE_WEIGHT = 2.2e-10  # plus this for each weight and row of the minibatch
 COMPILED_STEP = 1.5e-6
 COMPILED_ROW = 0.15e-6  # a row of a minibatch: a constant part,
 COMPILED_WEIGHT = 1.2e-10  # plus this for each weight, without those of one-hot observations
-# Of compiled code with the environment in Python, for each call:
-BRIDGE_CALL = 0.05e-3
-# Of compiling, once on a machine for all trainings of a kind.
-COMPILING = 9.0
 
 # The time that compiled code must save against the library's loop: about half of the time of
 # compiling, which is then recovered with the second training.
 WORTH_COMPILING = 5.0
 # The assumed length of an episode, for budgets in episodes.
 STEPS_OF_EPISODE = 100
-
-PACE_AT_HOME = 3.9e-3  # of `machine_pace`'s work, on the machine of the measurements
 
 
 @dataclass(frozen=True)
@@ -136,12 +127,6 @@ class Work:
         step = COMPILED_STEP + COMPILED_WEIGHT * self.n_dense_weights
         return self.n_steps * step + self.n_updates * self.batch_size * row
 
-    @property
-    def bridged_seconds(self) -> float:
-        """Processor seconds in compiled code with the environment in Python."""
-        in_python = self.n_steps / self.n_envs * BRIDGE_CALL + self.n_steps * ENV_STEP
-        return self.compiled_seconds + in_python
-
 
 def work_of(
     kind: Literal["q", "policy"],
@@ -161,30 +146,6 @@ def work_of(
     return Work(
         kind, n_steps, n_envs, n_updates, batch_size, n_layers, n_weights, n_weights - by_number
     )
-
-
-# The function that is compiled last in a training of each kind.
-_LAST_COMPILED = {"q": "learn_from_minibatch", "policy": "learn_from_rollout_minibatch"}
-
-
-def compiling_seconds(work: Work) -> float:
-    """Seconds of compiling on this machine: 0 if the result is in the cache."""
-    code = folder()
-    found = code is not None and any(code.glob(f"*/*.{_LAST_COMPILED[work.kind]}-*.nbi"))
-    return 0.0 if found else COMPILING
-
-
-def machine_pace() -> float:
-    """The time that this machine takes, relative to the machine of the measurements."""
-    rows, weights = th.ones(64, 64), th.full((64, 64), 1 / 64)
-    taken = []
-    with th.no_grad():
-        for _ in range(7):
-            began = time.process_time()
-            for _ in range(150):
-                rows = th.tanh(rows @ weights) + 0.1
-            taken.append(time.process_time() - began)
-    return statistics.median(taken) / PACE_AT_HOME
 
 
 # The argument ``engine`` of the library's agents, and its effect on training.

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from gymnasium import spaces
 
+from rl_yardstick.envs import DEFAULT_PULLS
 from rl_yardstick.envs.argument_checks import check_numbers, check_table
 from rl_yardstick.envs.bandits.bandit import StochasticBandit
 from rl_yardstick.envs.finite_env import first_above
-from rl_yardstick.envs.registration import DEFAULT_PULLS
 from rl_yardstick.mdp.transition_model import Floats, TransitionModel
 
 # How far probabilities of segments may be from summing to one.

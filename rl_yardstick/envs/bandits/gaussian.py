@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from gymnasium import spaces
 
+from rl_yardstick.envs import DEFAULT_PULLS
 from rl_yardstick.envs.argument_checks import check_number, check_numbers
 from rl_yardstick.envs.bandits.bandit import StochasticBandit, agreed_size
-from rl_yardstick.envs.registration import DEFAULT_PULLS
 from rl_yardstick.mdp.transition_model import Floats
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from rl_yardstick.envs import DEFAULT_PULLS
 from rl_yardstick.envs.argument_checks import check_number, check_table
 from rl_yardstick.envs.bandits.bandit import StochasticBandit, agreed_size
-from rl_yardstick.envs.registration import DEFAULT_PULLS
 
 
 class LinearBandit(StochasticBandit):
