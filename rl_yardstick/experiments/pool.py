@@ -115,8 +115,9 @@ class Workers:
 
     def __init__(self, n_at_once: int, timeout: float | None = None) -> None:
         if n_at_once < 1:  # as many as there are cores that this process may use
-            has_affinity = hasattr(os, "sched_getaffinity")
-            n_at_once = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+            n_at_once = os.cpu_count() or 1
+            if hasattr(os, "sched_getaffinity"):
+                n_at_once = len(os.sched_getaffinity(0))
         self.n_at_once, self.timeout = n_at_once, timeout
         self.words = f"{n_at_once} at once"
         self._pool: ProcessPool | None = None

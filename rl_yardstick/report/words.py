@@ -437,7 +437,7 @@ class Why:
     """The explanation of one run."""
 
     lines: list[str]
-    proposal: str | None  # a change that may help, as ``explain.py --test`` takes it
+    proposal: str | None  # a change that may help, as ``explain --test`` takes it
 
 
 def whys_of(runs: Sequence[PlannedRun]) -> list[Why | None]:
