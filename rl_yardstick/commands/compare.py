@@ -427,6 +427,8 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
                     f"agent ({', '.join(algos)}): {algos[0]}:{word}"
                 )
             algo, name = algos[0], word
+        if algo in files:
+            raise UserError(f"--conf-file names two files for {algo}")
         files[algo] = Path(name)
         if not files[algo].is_file():
             raise UserError(f"--conf-file: there is no file {name}")
