@@ -80,12 +80,13 @@ def main() -> int:
     args = build_parser().parse_args()
 
     from rl_yardstick.commands.terminal import TextConsole
-    from rl_yardstick.pipeline.playing import check_film_path
 
     if args.n_envs > 1 and (args.record is not None or args.render in ("human", "ansi")):
         shown = "--record" if args.record is not None else f"--render {args.render}"
         raise UserError(f"{shown} shows one environment: leave out --n-envs")
     if args.record is not None:
+        from rl_yardstick.report.films import check_film_path
+
         check_film_path(Path(args.record))
     console = TextConsole(quiet=args.verbose < 1)
     play(console, found_model(console, wanted_model(args)), args)
@@ -146,7 +147,7 @@ def play(console: Console, found: Model, args: argparse.Namespace) -> None:
 
         from rl_yardstick.commands.terminal import say
         from rl_yardstick.pipeline.models import load_agent
-        from rl_yardstick.pipeline.playing import play_episodes, playing_env, write_film
+        from rl_yardstick.pipeline.playing import play_episodes, playing_env
 
         if args.num_threads > 0:
             th.set_num_threads(args.num_threads)
@@ -166,6 +167,8 @@ def play(console: Console, found: Model, args: argparse.Namespace) -> None:
     env.close()
     if args.record is not None:
         with console.status("writing the film"):
+            from rl_yardstick.report.films import write_film
+
             write_film(Path(args.record), show.frames)
         say(console, f"film: {args.record}")
     with console.status("computing the policy's expected return"):
@@ -191,10 +194,10 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
 
 def expected_lines(spec: TrainSpec, agent: Any, deterministic: bool) -> list[str]:
     """The policy's exact evaluation, or why figures are sampled; empty if the model is unknown."""
+    from rl_yardstick.agents.policies import why_not_exact
     from rl_yardstick.commands.terminal import result_lines
     from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
     from rl_yardstick.pipeline.evaluation.judge import by_histories, world_of_memory
-    from rl_yardstick.pipeline.evaluation.policies import why_not_exact
 
     world = world_of_memory(spec, agent) if deterministic else None
     if world is not None and (found := by_histories(spec, agent, world)) is not None:
@@ -239,7 +242,7 @@ class Show:
         """Draw the state with a figure for each action, and mark the chosen one."""
         from rich.table import Table
 
-        from rl_yardstick.pipeline.evaluation.policies import action_figures
+        from rl_yardstick.agents.policies import action_figures
 
         if not self.is_live:
             return

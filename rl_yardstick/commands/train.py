@@ -313,11 +313,9 @@ def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Training
     results = [] if outcome.pulled is None else [describe_pulls(outcome.pulled)]
     results += [] if outcome.final is None else result_lines(outcome.final)
     say(console, "\n".join(["", *results]) if results else "")
-    if outcome.advice is not None:
-        console.print(f"instead  {outcome.advice.instead}")
-        if outcome.advice.try_first:
-            console.print(f"try      {outcome.advice.try_first}")
-        say(console, "more     docs/not-learning.md")
+    exact = outcome.judge.exact
+    if exact and outcome.final and (told := exact.instead(outcome.agent, outcome.final)):
+        say(console, f"instead  {told}\nmore     docs/not-learning.md")
     say(console, "\n".join(["", *next_commands(run, spec.gym_packages, outcome)]))
     if outcome.watch is not None and spec.watch_learning is not None:
         from rl_yardstick.report.page.learning import write_learning_page

@@ -31,6 +31,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
+from rl_yardstick.agents.policies import own_values
 from rl_yardstick.diagnosis.proposals import proposals
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.envs.layout import action_names, state_name
@@ -47,10 +48,8 @@ from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.evaluation.advice import how_episodes_end, still_running
 from rl_yardstick.pipeline.evaluation.critics import learns_exploring_values
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
-from rl_yardstick.pipeline.evaluation.policies import own_values
 from rl_yardstick.pipeline.spec import TrainSpec
 
 MOST_OUTCOMES = 500_000  # of a model to plan in for an agent's objective: about a second
@@ -147,7 +146,7 @@ class Explanation:
 _Names = tuple[Callable[[int], str], tuple[str, ...]]
 
 
-class _Task(NamedTuple):
+class Task(NamedTuple):
     """The objective that the agent was trained for."""
 
     model: TransitionModel  # the model of the training environment
@@ -179,7 +178,7 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
         optimum=split.optimum,
         value=split.value,
         score=evaluator.yardstick.score(split.value),
-        ending=how_episodes_end(evaluator, policy),
+        ending=evaluator.ending(policy),
         losses=split.losses,
         n_states=int((split.losses > 0).sum()),
     )
@@ -207,7 +206,7 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
     return replace(explained, proposals=proposals(spec, found, explained.parts))
 
 
-def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _Task | None:
+def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> Task | None:
     """The agent's objective; None where it is unknown, too large, or of another shape."""
     discount, shape = getattr(agent, "gamma", None), evaluator.model.prob.shape
     if isinstance(agent, PlanningAgent | RandomAgent) or not isinstance(discount, int | float):
@@ -220,7 +219,7 @@ def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _
     explores = learns_exploring_values(spec, agent)
     if explores and getattr(agent, "exploration", "") == "epsilon_greedy":
         epsilon = float(getattr(agent, "exploration_rate", 0.0))
-    return _Task(model, float(discount), epsilon, _noisy(model, epsilon) if epsilon > 0 else model)
+    return Task(model, float(discount), epsilon, _noisy(model, epsilon) if epsilon > 0 else model)
 
 
 class Found:
@@ -232,7 +231,7 @@ class Found:
         agent: BaseAlgorithm,
         policy: NDArray[Any],
         split: GapByState,
-        task: _Task | None,
+        task: Task | None,
     ) -> None:
         self.evaluator, self.split, self.task, self.policy = evaluator, split, task, policy
         self.model, self.horizon, self.agent = evaluator.model, evaluator.horizon, agent
@@ -292,7 +291,7 @@ class Found:
             last = "look-ahead"
         return (*found, Part(last, reached - own, f"the agent itself returns {own:.4g}"))
 
-    def _of_values(self, task: _Task, beliefs: Floats) -> Iterator[tuple[str, float, str]]:
+    def _of_values(self, task: Task, beliefs: Floats) -> Iterator[tuple[str, float, str]]:
         """The policies of an agent that has values for each state."""
         if self.updates is not None:
             n_tried = int((self.updates > 0)[self.model.reachable].sum())
@@ -356,9 +355,9 @@ class Found:
 
     def is_caught(self) -> bool:
         """Whether most episodes run out of time, although those of the best policy end."""
-        if self.task is None or still_running(self.evaluator, self.policy, 1).sum() <= 0.5:
+        if self.task is None or self.evaluator.out_of_time(self.policy) <= 0.5:
             return False
-        return bool(still_running(self.evaluator, self.direct, 1).sum() < 0.5)
+        return self.evaluator.out_of_time(self.direct) < 0.5
 
     # --- by state ---------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from scipy.special import bdtr
 
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
+from rl_yardstick.agents.policies import is_network
 from rl_yardstick.envs.known_models import time_limit
 from rl_yardstick.mdp import (
     TransitionModel,
@@ -29,13 +30,11 @@ from rl_yardstick.mdp import (
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.components import constructor_parameters
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
-from rl_yardstick.pipeline.evaluation.advice import share_of_standing_still
-from rl_yardstick.pipeline.evaluation.policies import is_network
 from rl_yardstick.pipeline.settings import literal, shipped_hyperparams
 from rl_yardstick.pipeline.spec import TrainSpec
 
 if TYPE_CHECKING:
-    from rl_yardstick.diagnosis.explanation import Found, Part
+    from rl_yardstick.diagnosis.explanation import Found, Part, Task
 
 STEPS, EPISODES = "n_timesteps", "n_episodes"
 VARIANT = ("train_env_kwargs", "train_env_wrapper")
@@ -168,9 +167,7 @@ class _Case:
             return
         nearer = round(1 - 0.5 / found.horizon, 7)
         if "gamma" in self.known and task.discount < nearer:
-            seen = found.evaluator.observations
-            still = share_of_standing_still(found.agent, task.model, seen, task.discount)
-            weight = 4.0 * (STANDS_STILL[0] <= still <= STANDS_STILL[1])
+            weight = 4.0 * (STANDS_STILL[0] <= self._standing_still(task) <= STANDS_STILL[1])
             yield {"gamma": "auto"}, weight, self._gain(task.lived, nearer, values)
         if "initial_q" in self.known:
             best = values.max(axis=1)[task.model.reachable]
@@ -181,6 +178,18 @@ class _Case:
             weight = self.starved + self.lost.get("never tried", 0.0) + min(max(far, 0.0), 4.0)
             if high > own["initial_q"]:
                 yield {"initial_q": high}, (1 - self.out_of_reach) * weight, 0.0
+
+    def _standing_still(self, task: Task) -> float:
+        """The agent's start value divided by that of standing still; 0 if free or unknown."""
+        model, tables = task.model, getattr(self.found.agent.policy, "q_tables", None)
+        stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated
+        stays &= (model.prob > 0) & model.reachable[:, None, None]
+        observations = self.found.evaluator.observations
+        if tables is None or not stays.any() or task.discount >= 1 or observations.ndim != 1:
+            return 0.0
+        standing = float(model.reward[stays].max()) / (1 - task.discount)
+        values = tables.numpy().mean(axis=0)[observations].max(axis=1)
+        return float(model.initial @ values) / standing if standing < 0 else 0.0
 
     def _gain(self, model: TransitionModel, discount: float, before: Floats) -> float:
         """The share of the gap that planning with another model or discount closes."""

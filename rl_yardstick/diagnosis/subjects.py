@@ -286,7 +286,7 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     """A model's values at observations, shape (n, 2) or (n, 1); None where it has none."""
     import torch as th
 
-    from rl_yardstick.pipeline.evaluation.policies import own_values
+    from rl_yardstick.agents.policies import own_values
 
     policy, batch = model.policy, np.stack(observations)
     for holder in (policy, model):

@@ -393,7 +393,7 @@ def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
         UserError: if the agent does not observe the log's contexts, or needs further
             observations.
     """
-    from rl_yardstick.pipeline.evaluation.policies import policy_matrix, why_not_exact
+    from rl_yardstick.agents.policies import policy_matrix, why_not_exact
 
     agent: Any = policy.agent
     try:

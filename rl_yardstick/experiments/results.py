@@ -21,7 +21,7 @@ from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.evaluation.yardstick import with_memory
 from rl_yardstick.pipeline.files import read_arrays, read_bytes
-from rl_yardstick.pipeline.run import MEANINGS, RECORD, read_diagnosis
+from rl_yardstick.pipeline.run import MEANINGS, RECORD
 from rl_yardstick.verdicts import (
     UNBOUNDED,
     Band,
@@ -97,8 +97,10 @@ def read_compared(folder: Path) -> dict[str, Floats]:
     """Read the columns of the diagnosis that `pipeline.evaluation.critics` wrote."""
     path = folder / "diagnosis.csv"
     try:
-        found = read_diagnosis(read_bytes(path, MAX_TABLE))
-        return {name: found[name] for name in ("timesteps", *MEANINGS) if name in found}
+        content = io.BytesIO(read_bytes(path, MAX_TABLE))
+        found = pd.read_csv(content, dtype=np.float64, float_precision="round_trip")
+        known = [name for name in MEANINGS if name in found]
+        return {name: found[name].to_numpy() for name in ("timesteps", *known)}
     except (ValueError, KeyError) as error:
         raise UserError(f"{path} is damaged: it is no table of numbers by step") from error
 

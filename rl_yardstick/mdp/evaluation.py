@@ -105,6 +105,16 @@ def state_visitation(model: TransitionModel, policy: Policy, horizon: int | None
     return visits
 
 
+def last_visits(model: TransitionModel, policy: Policy, horizon: int, n_last: int) -> Floats:
+    """Expected visits to each state in the last steps before the limit, shape (S,)."""
+    visits = state_visitation(model, policy, horizon)
+    if n_last < horizon:
+        has_time = policy.ndim == 2 and policy.shape != model.prob.shape[:2]
+        before = policy[: horizon - n_last] if has_time and len(policy) == horizon > 1 else policy
+        visits = visits - state_visitation(model, before, horizon - n_last)
+    return np.maximum(visits, 0.0)
+
+
 def baseline_policies(model: TransitionModel) -> list[Floats]:
     """The matrices (S, A) of policies without learning: random first, then each constant action."""
     shape = (model.n_states, model.n_actions)

@@ -1,8 +1,7 @@
-"""Plays trained agents, episode by episode, and films them."""
+"""Plays trained agents, episode by episode."""
 
 from __future__ import annotations
 
-import io
 import os
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,7 +13,6 @@ import numpy as np
 
 from rl_yardstick.pipeline.environments import make_evaluation_env
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.files import replacing
 from rl_yardstick.pipeline.models import Model, take_statistics
 
 if TYPE_CHECKING:
@@ -84,7 +82,7 @@ def play_episodes(
     Yields:
         Return and length of each episode as it ends.
     """
-    from rl_yardstick.pipeline.evaluation.policies import Player
+    from rl_yardstick.pipeline.evaluation.sampled import Player
     from rl_yardstick.pipeline.finite_numbers import check_numbers
 
     choose = Player(model, env, "while it is played").predict
@@ -124,42 +122,3 @@ class FrameTaker:
         drawn: list[Any] = self._first_of_next + self.env.env_method("render")[0]
         self._first_of_next = [drawn.pop()] if done else []
         return drawn
-
-
-# --- films ----------------------------------------------------------------------------------------
-
-FRAMES_PER_SECOND = 10
-
-
-def check_film_path(path: Path) -> None:
-    """Check that a film can be written, before anything is played."""
-    if path.suffix != ".gif":
-        raise UserError(f"--record writes .gif files, not {path.name!r}")
-    if not path.absolute().parent.is_dir():
-        raise UserError(f"--record: there is no folder {path.parent}")
-
-
-def film_episode(
-    model: BaseAlgorithm, env: VecEnv, max_steps: int, *, deterministic: bool
-) -> tuple[list[Any], tuple[float, int] | None]:
-    """Play an episode; returns its frames, and return and length, None if it did not end."""
-    taker, frames = FrameTaker(env), list[Any]()
-    kept: Any = {"after_step": lambda done: frames.extend(taker.take(done))}
-    played = play_episodes(model, env, 1, max_steps, deterministic=deterministic, **kept)
-    return frames, next(played, None)
-
-
-def write_film(path: Path, frames: list[Any]) -> None:
-    """Write frames, uint8 of shape (height, width, 3), as a GIF."""
-    with replacing(path) as beside:
-        beside.write_bytes(as_gif(frames))
-
-
-def as_gif(frames: list[Any]) -> bytes:
-    """The content of a GIF file of frames, uint8 of shape (height, width, 3)."""
-    from PIL import Image
-
-    first, *others = [Image.fromarray(frame) for frame in frames]
-    duration, film = 1000 // FRAMES_PER_SECOND, io.BytesIO()
-    first.save(film, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-    return film.getvalue()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import platform
@@ -17,12 +16,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Self
 
-import numpy as np
 from filelock import FileLock, Timeout
 from pydantic import ValidationError
 from rich.console import Console
 
-from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import Stopped, UserError
 from rl_yardstick.pipeline.files import read_json, replacing, write_json, write_text
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -236,10 +233,3 @@ MEANINGS = {
     "gradient_cosine": "gradient: cosine with the exact one",
     "gradient_snr": "gradient: signal-to-noise ratio",
 }
-
-
-def read_diagnosis(content: bytes) -> dict[str, Floats]:
-    """The columns of a ``diagnosis.csv``, NaN for empty cells."""
-    names, *rows = csv.reader(content.decode().splitlines())
-    table = [[float(cell or "nan") for cell in row] for row in rows]
-    return dict(zip(names, np.array(table).T, strict=True))

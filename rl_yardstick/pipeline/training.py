@@ -25,7 +25,6 @@ from rl_yardstick.pipeline import callbacks
 from rl_yardstick.pipeline.components import action_noise, build, constructor_arguments
 from rl_yardstick.pipeline.environments import first_seed, make_training_env, training_changes
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line
-from rl_yardstick.pipeline.evaluation.advice import Advice, advice
 from rl_yardstick.pipeline.evaluation.critics import recorder_of
 from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
@@ -99,7 +98,6 @@ class Training:
 
     final: Evaluation | None = None  #: of the agent at the end; None if there are no evaluations
     pulled: callbacks.PullSummary | None = None  #: of a training on a bandit
-    advice: Advice | None = None  #: on an agent that has failed
     engine: str | None = None  #: whether it was compiled, and if not, why; None if unknown
     evaluation_steps = 0  #: environment steps of sampled evaluations
 
@@ -210,8 +208,6 @@ class Training:
             begun, evaluator = WorkTime.now(), evaluation.evaluator
             self.final = evaluator.at_the_end(agent)
             evaluation.taken += WorkTime.now() - begun
-            if not self.run.console.quiet:
-                self.advice = advice(self.spec, agent, evaluator, self.final, agent.num_timesteps)
             self.evaluation_steps = getattr(evaluator, "n_steps", 0)
         self.engine = getattr(agent, "engine_in_use", None)
         if self.pulls is not None and self.pulls.n_calls > 0:

@@ -1,10 +1,11 @@
-"""Films of agents: an episode of each run's final agent, and of its exploration in training.
+"""Films of agents: how a GIF is written, and which episodes of a study are filmed.
 
 Filming loads PyTorch. A study's own process does not: it calls `films_of` in a child process.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,6 +32,28 @@ TRAINING_STEPS = 500  # fifty seconds
 COLOURS = 128
 MAX_SIDE = 320  # pixels of a picture's longer side
 MAX_BYTES = 300_000  # of a film
+FRAMES_PER_SECOND = 10
+
+
+def check_film_path(path: Path) -> None:
+    """Check that a film can be written, before anything is played."""
+    if path.suffix != ".gif":
+        raise UserError(f"--record writes .gif files, not {path.name!r}")
+    if not path.absolute().parent.is_dir():
+        raise UserError(f"--record: there is no folder {path.parent}")
+
+
+def write_film(path: Path, frames: list[Any]) -> None:
+    """Write frames, uint8 of shape (height, width, 3), as a GIF."""
+    with replacing(path) as beside:
+        beside.write_bytes(_as_gif(frames))
+
+
+def _as_gif(frames: list[Any]) -> bytes:
+    first, *others = [Image.fromarray(frame) for frame in frames]
+    duration, film = 1000 // FRAMES_PER_SECOND, io.BytesIO()
+    first.save(film, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    return film.getvalue()
 
 
 def films_of(runs: Sequence[PlannedRun]) -> list[Path | None]:
@@ -47,19 +70,18 @@ def film_of(planned: PlannedRun) -> Path | None:
     if has_film(planned):
         return path
     from rl_yardstick.pipeline.evaluation.sampled import evaluation_seed
-    from rl_yardstick.pipeline.playing import as_gif, film_episode
 
     try:
         with _loaded(planned) as (agent, env):
             env.seed(evaluation_seed(planned.seed, 3))
-            frames, ended = film_episode(agent, env, MAX_STEPS, deterministic=True)
+            frames, ended = _filmed(agent, env, MAX_STEPS, deterministic=True)
     except (UserError, *MISTAKES):
         return None
     frames = _shrunk(frames)
-    film = as_gif(frames)
+    film = _as_gif(frames)
     n_kept = min(len(frames), max(len(frames) * MAX_BYTES // len(film), 1))
     with replacing(path) as beside:
-        beside.write_bytes(film if n_kept == len(frames) else as_gif(frames[:n_kept]))
+        beside.write_bytes(film if n_kept == len(frames) else _as_gif(frames[:n_kept]))
     total_return, length = ended or (None, None)
     episode = {"return": total_return, "steps": length, "frames": n_kept}
     write_json(path.with_suffix(".json"), episode)
@@ -88,6 +110,18 @@ def _loaded(planned: PlannedRun, which: Which = "final") -> Iterator[tuple[Any, 
         yield load_agent(model, env), env
     finally:
         env.close()
+
+
+def _filmed(
+    agent: Any, env: Any, max_steps: int, *, deterministic: bool
+) -> tuple[list[Any], tuple[float, int] | None]:
+    """The frames of an episode, and its return and length, None if it did not end."""
+    from rl_yardstick.pipeline.playing import FrameTaker, play_episodes
+
+    taker, frames = FrameTaker(env), list[Any]()
+    kept: Any = {"after_step": lambda done: frames.extend(taker.take(done))}
+    played = play_episodes(agent, env, 1, max_steps, deterministic=deterministic, **kept)
+    return frames, next(played, None)
 
 
 def _shrunk(frames: list[Any]) -> list[Any]:
@@ -124,7 +158,6 @@ def _films_of_training(planned: PlannedRun, folder: Path) -> Iterator[Path]:
     """A film for each checkpoint that was due, named by the number of the episode before it."""
     from rl_yardstick.experiments.results import read_episodes
     from rl_yardstick.pipeline.evaluation.sampled import evaluation_seed
-    from rl_yardstick.pipeline.playing import film_episode, write_film
 
     name = f"{file_name(planned.agent)}_{file_name(planned.environment)}"
     every, ends = planned.spec.save_every_n_episodes, read_episodes(planned.path).steps
@@ -136,7 +169,7 @@ def _films_of_training(planned: PlannedRun, folder: Path) -> Iterator[Path]:
         if not (path.exists() and path.stat().st_mtime >= checkpoint.stat().st_mtime):
             with _loaded(planned, n_steps) as (agent, env):
                 agent.set_random_seed(evaluation_seed(planned.seed, 4))
-                frames, _ = film_episode(agent, env, TRAINING_STEPS, deterministic=False)
+                frames, _ = _filmed(agent, env, TRAINING_STEPS, deterministic=False)
             folder.mkdir(exist_ok=True)
             write_film(path, frames)
         yield path

@@ -11,7 +11,7 @@ from rich.text import Text
 from rl_yardstick.commands import enjoy
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.pipeline.models import Wanted, find_model, load_agent
-from rl_yardstick.pipeline.playing import FRAMES_PER_SECOND
+from rl_yardstick.report.films import FRAMES_PER_SECOND
 from tests.pipeline.short_runs import LAKE, trained
 
 PAIR = ["--algo", "random", "--env", LAKE]

@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from rl_yardstick.agents.policies import own_values, policy_matrix
 from rl_yardstick.mdp import TransitionModel, policy_return, state_visitation
 from rl_yardstick.mdp.gaps import expected_estimates
 from rl_yardstick.pipeline.environments import make_training_env
@@ -22,7 +23,6 @@ from rl_yardstick.pipeline.evaluation.critics import (
     minibatches,
     recorder_of,
 )
-from rl_yardstick.pipeline.evaluation.policies import own_values, policy_matrix
 from tests.envs.corridors import Corridor
 from tests.pipeline.short_runs import LAKE, agent_of, run_of, spec_of
 from tests.pipeline.test_resuming import content

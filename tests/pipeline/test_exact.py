@@ -1,4 +1,4 @@
-"""Exact evaluation: agents' own actions, advice, and scales where the state is hidden."""
+"""Exact evaluation: agents' own actions, what failed ones do, scales where the state is hidden."""
 
 import math
 
@@ -8,14 +8,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
-from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents import load_algorithm, policies
+from rl_yardstick.agents.policies import policy_matrix
 from rl_yardstick.mdp import policy_return, value_iteration
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
-from rl_yardstick.pipeline.evaluation import judge, policies
-from rl_yardstick.pipeline.evaluation.advice import advice
+from rl_yardstick.pipeline.evaluation import judge
 from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
 from rl_yardstick.pipeline.evaluation.judge import by_histories, world_of_memory
-from rl_yardstick.pipeline.evaluation.policies import policy_matrix
 from rl_yardstick.pipeline.evaluation.sampled import evaluate
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of
@@ -227,60 +226,42 @@ def test_what_is_not_known_is_not_guessed():
 
 
 UP, DOWN, LEFT, RIGHT = range(4)  # of the warehouse
-PAIRS = 61 * 4  # states of the warehouse that can be reached, times actions
-
-
-def judged(env_id, table, n_steps=10**6, algo="qlearning", env_kwargs=None, **arguments):
-    """Advice on an agent with these values: by state a row, or one row for all."""
-    spec = spec_for(algo, env_id, {"env_kwargs": env_kwargs or {}, **arguments})
-    agent = agent_of(algo, make_training_env(spec, None), **arguments)
-    if table is None:
-        agent.learn(1)
-    else:
-        for state, row in table.items() if isinstance(table, dict) else [(slice(None), table)]:
-            agent.policy.q_tables[0, state] = th.tensor(row, dtype=th.float64)
-    evaluator = exact_evaluator(spec)
-    return advice(spec, agent, evaluator, evaluator(agent), n_steps)
-
-
 LATE = "100% of its episodes run out of time"
+WELL = "the best"
 
 
-def prefers(action, low=-1.0, high=0.0):
-    return [high if i == action else low for i in range(4)]
-
-
-AGAINST_THE_WALL = prefers(UP)
-BETWEEN_TWO = {90: prefers(RIGHT), 91: prefers(LEFT)}
-INTO_THE_HOLE = {0: prefers(2), 1: prefers(1)}  # on the lake 1 is down and 2 is right
+def prefers(action):
+    return [0.0 if i == action else -1.0 for i in range(4)]
 
 
 @pytest.mark.parametrize(
-    ("env_id", "table", "instead"),
+    ("env_id", "rows", "instead"),
     [
-        (WAREHOUSE, AGAINST_THE_WALL, f"{LATE}: it stays at row 8, column 1"),
-        (WAREHOUSE, BETWEEN_TWO, f"{LATE}: it circles between row 10, column 1; row 10, colu"),
-        (LAKE, INTO_THE_HOLE, "100% of its episodes end before the time limit, 0.0% of all with"),
+        (WAREHOUSE, prefers(UP), f"{LATE}: it stays at row 8, column 1"),
+        (
+            WAREHOUSE,
+            {90: prefers(RIGHT), 91: prefers(LEFT)},
+            f"{LATE}: it circles between row 10, column 1; row 10, colu",
+        ),
+        (  # on the lake 1 is down and 2 is right
+            LAKE,
+            {0: prefers(2), 1: prefers(1)},
+            "100% of its episodes end before the time limit, 0.0% of all with",
+        ),
         ("Taxi-v4", [0, 0, 0, 0, 0, -1], f"{LATE}: it never leaves 60 of 400 states"),
+        ("Taxi-v4", WELL, None),
     ],
 )
-def test_what_it_does_instead(env_id, table, instead):
-    env_kwargs = {"is_slippery": False} if env_id == LAKE else {}
-    assert judged(env_id, table, env_kwargs=env_kwargs).instead.startswith(instead)
-
-
-@pytest.mark.parametrize(
-    ("start_value", "n_steps", "try_first"),
-    [
-        (-81.0, 400 * PAIRS, "-params gamma:0.9995 (now gamma 0.99)"),
-        (-79.0, 130 * PAIRS, None),
-        (-79.0, PAIRS, "-n 1000000 (now 1 for each state and action)"),
-    ],
-)
-def test_by_two_signals(start_value, n_steps, try_first):
-    """Standing still costs 1 a step: -100 at a discount of 0.99, of which -80 are four fifths."""
-    table = prefers(UP, low=start_value - 1, high=start_value)
-    assert judged("Warehouse-v0", table, n_steps, gamma=0.99).try_first == try_first
+def test_what_a_failed_agent_does_instead(env_id, rows, instead):
+    spec = spec_for(
+        "qlearning", env_id, {"env_kwargs": {"is_slippery": False} if env_id == LAKE else {}}
+    )
+    agent, evaluator = agent_of("qlearning", make_training_env(spec, None)), exact_evaluator(spec)
+    rows = evaluator.optimum[1].astype(float) if rows is WELL else rows
+    for state, row in rows.items() if isinstance(rows, dict) else [(slice(None), rows)]:
+        agent.policy.q_tables[0, state] = th.tensor(row, dtype=th.float64)
+    found = evaluator.instead(agent, evaluator(agent))
+    assert found is None if instead is None else found.startswith(instead)
 
 
 CORRIDOR, TIGER = "ShortCorridor-v0", "Tiger-v0"

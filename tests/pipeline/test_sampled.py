@@ -21,7 +21,6 @@ from rl_yardstick.pipeline.evaluation.sampled import (
     SampledEvaluator,
     Yardstick,
     bracketed_yardstick,
-    compiled_copy,
     evaluate,
     evaluate_compiled,
     evaluation_seed,
@@ -205,7 +204,7 @@ def test_compiled_play_is_the_same_to_the_bit(monkeypatch, algo, env_id, wrapper
         if numbers.is_floating_point():
             numbers.add_(th.randn(numbers.shape, generator=generator, dtype=numbers.dtype))
     ours, plain = environments(env_id, wrapper), environments(env_id, wrapper)
-    copy = compiled_copy(ours)
+    copy = engine.compiled_copy(ours)
     # More than one go, and further episodes that go on from where the generators were left.
     for i, play in enumerate([(5, 1), (23, None), (2, None), (5, 0)]):
         if i == 2:
@@ -215,4 +214,6 @@ def test_compiled_play_is_the_same_to_the_bit(monkeypatch, algo, env_id, wrapper
         assert (found.returns.dtype, found.lengths.dtype) == (expected.returns.dtype, np.int64)
         assert found.successes is expected.successes is None
     # Where evaluation is exact, or nothing is compiled, there is no copy.
-    assert [compiled_copy(make_vec_env(name, 1)) for name in (LAKE, "Acrobot-v1")] == [None] * 2
+    assert [engine.compiled_copy(make_vec_env(name, 1)) for name in (LAKE, "Acrobot-v1")] == [
+        None
+    ] * 2

@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from rl_yardstick.agents.common.callbacks import (
     EpisodeBudget,
@@ -19,6 +19,7 @@ from rl_yardstick.agents.common.callbacks import (
 )
 from rl_yardstick.agents.compiled.env_states import (
     COMPENSATED_SUM,
+    DECIMALS,
     EnvStates,
     Episodes,
     observed_world,
@@ -27,7 +28,13 @@ from rl_yardstick.agents.compiled.env_states import (
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
 from rl_yardstick.agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
 from rl_yardstick.agents.compiled.references import handles_of
-from rl_yardstick.agents.compiled.worlds import EPISODE, PROGRESS, NotCompilable, draws_alike
+from rl_yardstick.agents.compiled.worlds import (
+    EPISODE,
+    PROGRESS,
+    NotCompilable,
+    draws_alike,
+    monitor_of,
+)
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Ints
 
@@ -329,17 +336,38 @@ class Plan(NamedTuple):
             envs[i].obs = envs[i].new_obs
 
 
-def play_episodes(
-    world: Any, player: Any, states: EnvStates, observations: Any, wanted: Ints
-) -> Episodes:
-    """Play the wanted numbers of episodes on environments that have just been reset.
+# Environments for evaluation, their compiled counterpart, and what converts its observations.
+CompiledCopy = tuple[DummyVecEnv, Any, Any]
+
+
+def compiled_copy(env: VecEnv) -> CompiledCopy | None:
+    """The compiled copy of CartPole or MountainCar, plain or in Monitor; None for others."""
+    from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
+
+    if not isinstance(env, DummyVecEnv) or any(monitor_of(each) is None for each in env.envs):
+        return None
+    if not isinstance(env.envs[0].unwrapped, CartPoleEnv | MountainCarEnv):
+        return None
+    try:
+        return (env, *observed_world(env))
+    except NotCompilable:
+        return None
+
+
+def play_episodes(agent: Any, copy: CompiledCopy, n_episodes: int) -> Episodes:
+    """Reset the environments and play episodes, as many in each as `evaluate_policy` would.
 
     All environments step until each has ended its number of episodes. The environments, their
     generators and their Monitors end in the state in which `evaluate_policy` would leave them.
+    Returns are rounded as in Monitor.
     """
+    env, world, seen = copy
+    n_envs, player = env.num_envs, agent.greedy_player(seen)
+    wanted = (n_episodes + np.arange(n_envs)) // n_envs
+    states = EnvStates(env, world, seen)
+    observations = env.reset()
     states.read()
     states.take_observations(observations)
-    n_envs = len(wanted)
     # Handles do not keep their generators alive.
     generators = [env.unwrapped.np_random for env in states.vec_env.envs]
     handles, progress = handles_of(generators), np.zeros(1, dtype=PROGRESS)
@@ -363,7 +391,9 @@ def play_episodes(
     n_done = int(progress["num_timesteps"][0]) // n_envs
     record_in_monitors(states.monitors, Episodes.of(ended), n_done)
     states.write()
-    return Episodes.of(ended[_are_first(ended["env"], wanted)])
+    found = Episodes.of(ended[_are_first(ended["env"], wanted)])
+    found.returns[:] = [round(total, DECIMALS) for total in found.returns.tolist()]
+    return found
 
 
 def _are_first(envs: Ints, wanted: Ints) -> Bools:

@@ -21,6 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from rl_yardstick.agents import policies
 from rl_yardstick.agents.common.callbacks import BlockCallback
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
 from rl_yardstick.agents.planning import PlanningAgent
@@ -29,8 +30,7 @@ from rl_yardstick.mdp import TransitionModel, state_visitation
 from rl_yardstick.mdp.gaps import PolicyValues, discounted_values, expected_estimates
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.pipeline.evaluation import policies
-from rl_yardstick.pipeline.evaluation.exact import is_wrapped_as_vector
+from rl_yardstick.pipeline.evaluation.exact import OfLastPolicy, is_wrapped_as_vector
 from rl_yardstick.pipeline.files import write_text
 from rl_yardstick.pipeline.run import MEANINGS
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -57,7 +57,7 @@ class KnownWorld:
     is_limited: bool = True  # whether ``horizon`` limits training; else only evaluations
 
     @cached_property
-    def visits(self) -> policies.OfLastPolicy[Floats]:
+    def visits(self) -> OfLastPolicy[Floats]:
         """The function from a policy (S, A) to the share of its steps in each state, shape (S,)."""
 
         def shares(policy: Floats) -> Floats:
@@ -66,15 +66,15 @@ class KnownWorld:
             visits = state_visitation(self.model, given, self.horizon)
             return np.asarray(visits / visits.sum())
 
-        return policies.OfLastPolicy(shares)
+        return OfLastPolicy(shares)
 
     @cached_property
-    def _values(self) -> dict[float, policies.OfLastPolicy[PolicyValues]]:
+    def _values(self) -> dict[float, OfLastPolicy[PolicyValues]]:
         return {}
 
     def values(self, policy: Floats, discount: float) -> PolicyValues:
         """The exact values of a policy (S, A)."""
-        new = policies.OfLastPolicy(lambda asked: discounted_values(self.model, asked, discount))
+        new = OfLastPolicy(lambda asked: discounted_values(self.model, asked, discount))
         return self._values.setdefault(discount, new)(policy)
 
     @cached_property

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rl_yardstick import mdp
+from rl_yardstick.agents import policies
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.envs import known_models
 from rl_yardstick.envs.layout import GridLayout, grid_layout
@@ -30,9 +31,8 @@ from rl_yardstick.mdp.beliefs import Bracket, memory_optimum
 from rl_yardstick.mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats
 from rl_yardstick.pipeline.environments import evaluation_kwargs, make_single_env
-from rl_yardstick.pipeline.evaluation import policies
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
-from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
+from rl_yardstick.pipeline.evaluation.yardstick import FAILED, HiddenState, Yardstick
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # Limit for the array with the observations of all states.
@@ -44,9 +44,32 @@ MOST_BACKUPS = 20_000_000_000
 # The most steps x outcomes of all states and actions for which `OtherReturns` are computed: in a
 # millisecond on a small model, and in about two seconds at most.
 MOST_OUTCOMES_OF_OTHERS = 600_000_000
+# An episode is stuck in a few states if it spends nearly all of its last steps there.
+LAST_STEPS, NEARLY_ALL = 100, 0.99
+MOST_STATES_NAMED = 3
 # The most cached evaluators, and the most states of their models.
 MOST_KEPT = 8
 MOST_STATES_KEPT = 20_000
+
+
+Result = TypeVar("Result")
+
+
+class OfLastPolicy(Generic[Result]):
+    """Caches the last result of a function of a policy, because policies often stay the same."""
+
+    def __init__(self, work: Callable[[NDArray[Any]], Result]) -> None:
+        self._work = work
+        self._last: tuple[NDArray[Any], Result] | None = None
+
+    def __call__(self, policy: NDArray[Any]) -> Result:
+        """Return the result for a policy in one of the forms of `mdp.evaluation`."""
+        last = self._last
+        if last is not None and last[0].dtype == policy.dtype and np.array_equal(last[0], policy):
+            return last[1]
+        result = self._work(policy)
+        self._last = policy.copy(), result
+        return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +179,7 @@ class ExactEvaluator:
         return cache(lambda d: mdp.finite_horizon_optimum(self.model, self.horizon, d).start_value)
 
     @cached_property
-    def _worth(self) -> policies.OfLastPolicy[Evaluation]:
+    def _worth(self) -> OfLastPolicy[Evaluation]:
         def worth(policy: NDArray[Any]) -> Evaluation:
             found = mdp.policy_return(self.model, policy, self.horizon, success=self.success)
             rate, std = found.success_rate, float(np.sqrt(found.return_variance))
@@ -164,12 +187,12 @@ class ExactEvaluator:
             successes = None if rate is None else np.array([rate])
             return Evaluation(returns, lengths, successes, std, self.yardstick)
 
-        return policies.OfLastPolicy(worth)
+        return OfLastPolicy(worth)
 
     @cached_property
-    def values(self) -> policies.OfLastPolicy[Floats]:
+    def values(self) -> OfLastPolicy[Floats]:
         """The function from a policy to its state values, shape (S,); see `state_values`."""
-        return policies.OfLastPolicy(lambda p: mdp.state_values(self.model, p, self.horizon))
+        return OfLastPolicy(lambda p: mdp.state_values(self.model, p, self.horizon))
 
     @cached_property
     def optimum(self) -> tuple[Floats, Bools]:
@@ -184,6 +207,47 @@ class ExactEvaluator:
         if deterministic and not isinstance(agent, RandomAgent):
             return policies.best_actions(agent, self.observations, self.masks)
         return policies.policy_matrix(agent, self.observations, deterministic, self.masks)
+
+    def instead(self, agent: BaseAlgorithm, found: Evaluation) -> str | None:
+        """What a failed agent's greedy policy does; None if it has not failed, or is random."""
+        if isinstance(agent, RandomAgent):
+            return None
+        policy, yardstick = self.policy(agent, deterministic=True), self.yardstick
+        has_failed = yardstick.has_scale and yardstick.score(found.mean_return) < FAILED
+        if not has_failed:  # unless only the best policies end their episodes
+            best = self.optimum[1].argmax(axis=1)
+            has_failed = self.out_of_time(best) < NEARLY_ALL <= self.out_of_time(policy)
+        return self.ending(policy) if has_failed else None
+
+    def out_of_time(self, policy: NDArray[Any]) -> float:
+        """The share of a policy's episodes that run out of time."""
+        return float(mdp.last_visits(self.model, policy, self.horizon, 1).sum())
+
+    def ending(self, policy: NDArray[Any]) -> str:
+        """How the episodes of a policy end, or in which states they get stuck."""
+        model, horizon = self.model, self.horizon
+        share = self.out_of_time(policy)
+        if share < 0.5:
+            found = mdp.policy_return(model, policy, horizon, success=self.success)
+            end, rate = (
+                f"{1 - share:.0%} of its episodes end before the time limit",
+                found.success_rate,
+            )
+            return end if rate is None else f"{end}, {rate:.1%} of all with success"
+        late = mdp.last_visits(model, policy, horizon, min(LAST_STEPS, max(horizon // 2, 1)))
+        order = np.argsort(-late, kind="stable")
+        n_states = int(np.searchsorted(np.cumsum(late[order]), NEARLY_ALL * late.sum())) + 1
+        named = order[:MOST_STATES_NAMED]
+        places = [f"state {state}" for state in named]
+        if self.layout is not None:
+            places = [self.layout.place_name(int(cell)) for cell in self.layout.cells[named]]
+        where = f"it stays at {places[0]}"
+        if n_states > MOST_STATES_NAMED:
+            n_reachable = int(model.reachable.sum())
+            where = f"it never leaves {n_states} of {n_reachable} states, such as {places[0]}"
+        elif n_states > 1:
+            where = f"it circles between {'; '.join(places[:n_states])}"
+        return f"{share:.0%} of its episodes run out of time: {where}"
 
     def obstacle(self, agent: BaseAlgorithm, deterministic: bool = True) -> str:
         """Why the policy cannot be computed, or only too slowly; empty if it can."""

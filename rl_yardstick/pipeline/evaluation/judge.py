@@ -20,11 +20,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
+from rl_yardstick.agents import policies
 from rl_yardstick.agents.planning import RandomAgent
 from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Ints
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_single_env, remembers
-from rl_yardstick.pipeline.evaluation import policies
 from rl_yardstick.pipeline.evaluation.exact import (
     ExactEvaluator,
     evaluator_of_single,

@@ -11,19 +11,21 @@ import math
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3 import A2C
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
+from rl_yardstick.agents.common.masks import check_masks_exist, present_masks
+from rl_yardstick.agents.policies import is_network, takes_masks
 from rl_yardstick.envs.brackets import may_have_bracket, optimum_bracket
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.pipeline.evaluation.policies import Player, is_network
+from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 from rl_yardstick.pipeline.finite_numbers import check_numbers
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -104,6 +106,32 @@ class Evaluation:
         if self.others is not None:
             figures |= asdict(self.others)
         return figures
+
+
+class Player:
+    """An agent in environments: it is told action masks, and sees finite observations only.
+
+    Raises:
+        UserError: if it takes masks, and the environments have none.
+    """
+
+    def __init__(self, model: BaseAlgorithm, env: VecEnv, when: str) -> None:
+        self.model, self.env, self.when = model, env, when
+        self.is_masked = takes_masks(model)
+        try:
+            if self.is_masked:
+                check_masks_exist(env)
+        except ValueError as error:
+            needs = f"{type(model).__name__} needs action masks, and the environment has none"
+            raise UserError(needs) from error
+
+    def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """Check the observation, then predict."""
+        check_numbers(observation, "observation", self.when, in_rows=True)
+        if self.is_masked:
+            kwargs["action_masks"] = present_masks(self.env, observation)
+        actions, state = self.model.predict(observation, **kwargs)
+        return actions, state
 
 
 def evaluate(
@@ -197,11 +225,6 @@ PRECISION = 0.05
 PRECISION_AT_THE_END = 0.01
 
 
-# Evaluation environments of CartPole or MountainCar, their compiled counterpart for
-# `agents.compiled.loop`, and what converts its observations.
-CompiledCopy = tuple[DummyVecEnv, Any, Any]
-
-
 class SampledEvaluator:
     """Evaluates by episodes: a given number, or as few as are precise enough."""
 
@@ -275,10 +298,12 @@ class SampledEvaluator:
         at_first = min(at_first * n_trained, STEPS_AT_FIRST)
         return max(usual * n_trained, at_first, STEPS_IN_ANY_CASE)
 
-    def _compiled_copy(self, model: BaseAlgorithm) -> CompiledCopy | None:
+    def _compiled_copy(self, model: BaseAlgorithm) -> Any:
         """The compiled evaluation environments, if the agent trains in compiled code."""
         if getattr(model, "engine_in_use", "") != "compiled":
             return None
+        from rl_yardstick.agents.compiled.engine import compiled_copy
+
         return compiled_copy(self.env)
 
 
@@ -294,41 +319,16 @@ def n_environments(n_eval_envs: int, n_episodes: int | None) -> int:
     return min(n_eval_envs, STAGES[0] if n_episodes is None else n_episodes)
 
 
-def compiled_copy(env: VecEnv) -> CompiledCopy | None:
-    """The compiled copy of CartPole or MountainCar, plain or in Monitor; None for others."""
-    from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
-
-    from rl_yardstick.agents.compiled.env_states import observed_world
-    from rl_yardstick.agents.compiled.worlds import NotCompilable, monitor_of
-
-    if not isinstance(env, DummyVecEnv) or any(monitor_of(each) is None for each in env.envs):
-        return None
-    if not isinstance(env.envs[0].unwrapped, CartPoleEnv | MountainCarEnv):
-        return None
-    try:
-        return (env, *observed_world(env))
-    except NotCompilable:
-        return None
-
-
 def evaluate_compiled(
-    model: BaseAlgorithm, copy: CompiledCopy, n_episodes: int, seed: int | None
+    model: BaseAlgorithm, copy: Any, n_episodes: int, seed: int | None
 ) -> Evaluation:
     """Like `evaluate`, in compiled code; the library's network decides near ties."""
     from rl_yardstick.agents.compiled.engine import play_episodes
-    from rl_yardstick.agents.compiled.env_states import DECIMALS, EnvStates
     from rl_yardstick.agents.networks.perceptron import one_thread
 
-    env, world, seen = copy
     if seed is not None:
-        env.seed(seed)
-    # As many episodes per environment as in `evaluate_policy`.
-    wanted = (n_episodes + np.arange(env.num_envs)) // env.num_envs
-    states, acting = EnvStates(env, world, seen), cast(Any, model).greedy_player(seen)
+        copy[0].seed(seed)
     with one_thread() if is_network(model) else nullcontext():
-        found = play_episodes(world, acting, states, env.reset(), wanted)
-    # Rounded as in Monitor.
-    returns = np.array([round(total, DECIMALS) for total in found.returns.tolist()])
-    when = f"in the evaluation at step {model.num_timesteps:,}"
-    check_numbers(returns, "return", when)
-    return Evaluation(returns, found.lengths, None)
+        found = play_episodes(model, copy, n_episodes)
+    check_numbers(found.returns, "return", f"in the evaluation at step {model.num_timesteps:,}")
+    return Evaluation(found.returns.copy(), found.lengths, None)

@@ -6,7 +6,7 @@ import inspect
 import sys
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -15,19 +15,15 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import VecEnv
 
 from rl_yardstick.agents.bandits.rules import PreferenceBandit
 from rl_yardstick.agents.bandits.tables import ValueBandit
 from rl_yardstick.agents.common.exploration import BOLTZMANN
-from rl_yardstick.agents.common.masks import check_masks_exist, present_masks
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm, tiles_of_all, vectors_of
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.finite_numbers import check_numbers
 
 
 def is_of_library(module: str) -> bool:
@@ -59,52 +55,6 @@ def takes_masks(model: Any) -> bool:
 @lru_cache(maxsize=64)
 def _parameters(predict: Callable[..., Any]) -> frozenset[str]:
     return frozenset(inspect.signature(predict).parameters)
-
-
-class Player:
-    """An agent in environments: it is told action masks, and sees finite observations only.
-
-    Raises:
-        UserError: if it takes masks, and the environments have none.
-    """
-
-    def __init__(self, model: BaseAlgorithm, env: VecEnv, when: str) -> None:
-        self.model, self.env, self.when = model, env, when
-        self.is_masked = takes_masks(model)
-        try:
-            if self.is_masked:
-                check_masks_exist(env)
-        except ValueError as error:
-            needs = f"{type(model).__name__} needs action masks, and the environment has none"
-            raise UserError(needs) from error
-
-    def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """Check the observation, then predict."""
-        check_numbers(observation, "observation", self.when, in_rows=True)
-        if self.is_masked:
-            kwargs["action_masks"] = present_masks(self.env, observation)
-        actions, state = self.model.predict(observation, **kwargs)
-        return actions, state
-
-
-Result = TypeVar("Result")
-
-
-class OfLastPolicy(Generic[Result]):
-    """Caches the last result of a function of a policy, because policies often stay the same."""
-
-    def __init__(self, work: Callable[[NDArray[Any]], Result]) -> None:
-        self._work = work
-        self._last: tuple[NDArray[Any], Result] | None = None
-
-    def __call__(self, policy: NDArray[Any]) -> Result:
-        """Return the result for a policy in one of the forms of `mdp.evaluation`."""
-        last = self._last
-        if last is not None and last[0].dtype == policy.dtype and np.array_equal(last[0], policy):
-            return last[1]
-        result = self._work(policy)
-        self._last = policy.copy(), result
-        return result
 
 
 # The most input numbers of a network per call, and in total; above, playing episodes is faster than
