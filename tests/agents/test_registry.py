@@ -3,6 +3,7 @@
 import importlib.util
 import math
 import sys
+from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
@@ -28,15 +29,6 @@ NETWORKS = [*DEEP_Q, "ppo", "a2c", "qrdqn", "trpo", "ars", "ppo_lstm"]
 CONTINUOUS = ["ppo", "a2c", "sac", "td3", "ddpg", "tqc", "crossq", "trpo", "ars", "ppo_lstm"]
 
 
-@pytest.fixture(autouse=True)
-def table():
-    """Whatever is added goes away again."""
-    before = dict(ALGORITHMS)
-    yield
-    ALGORITHMS.clear()
-    ALGORITHMS.update(before)
-
-
 def test_every_name_stands_for_an_algorithm_of_its_own():
     classes = {name: load_algorithm(name) for name in ALGORITHMS}
     assert len(set(classes.values())) == len(ALGORITHMS)
@@ -49,8 +41,6 @@ def test_every_name_stands_for_an_algorithm_of_its_own():
         default = parameter and parameter.default
         assert (len(entry.engines) > 1) == (default is not None), name
         assert default in {None, *entry.engines[:1]}, name
-    with pytest.raises(KeyError):
-        load_algorithm("qlerning")
 
 
 @pytest.mark.parametrize(
@@ -127,6 +117,7 @@ MINE = "some_module:Mine"
         ("mine", MINE, {"action": ["Box"]}, "mine: an entry has no action"),
     ],
 )
+@patch.dict(ALGORITHMS)  # whatever is added goes away again
 def test_what_cannot_be_registered(name, entry_point, fields, complaint):
     agents.register("taken", MINE)
     before = dict(ALGORITHMS)
