@@ -53,38 +53,23 @@ def both_shaped(env):
     return wrap.TerminationReward(ClipReward(wrap.ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
 
 
-def rows():
-    """Each agent as the contract has it, in one of the worlds; and wrappers, vectors, masks."""
-    numbers, places = itertools.cycle((1, 3, 8)), itertools.cycle(WORLDS)
-    for name in TABULAR:
-        place = next(places)
-        yield f"{name} {place}", name, WORLDS[place], next(numbers), trainings.AGENTS[name][1]
-    for name in TILED:
-        env_id, settings = trainings.AGENTS[name]
-        yield f"{name} {env_id}", name, (env_id, {}), 2, settings
-    for wrapper in (both_shaped, wrap.FlattenToDiscrete):
-        slippery = HOUSE, {**SLIPPERY, "wrapper": wrapper}
-        yield f"under {wrapper.__name__}", "sarsa", slippery, 2, {"learning_rate": 0.3}
-    yield "bins of CartPole", "qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, trainings.LESS
-    yield (
-        "tiles of CartPole",
-        "semi_gradient_q",
-        ("CartPole-v1", {}),
-        1,
-        {**SWING, **trainings.LESS},
-    )
+AGENTS, MASKED = trainings.AGENTS, {"mask_actions": True}
+TURNS = zip(TABULAR, itertools.cycle(WORLDS), itertools.cycle((1, 3, 8)))
+ROWS = {  # each agent as the contract has it, in one of the worlds; and wrappers, vectors, masks
+    **{f"{name} {place}": (name, WORLDS[place], n, AGENTS[name][1]) for name, place, n in TURNS},
+    **{name: (name, (AGENTS[name][0], {}), 2, AGENTS[name][1]) for name in TILED},
+    "under three": ("sarsa", (HOUSE, {**SLIPPERY, "wrapper": both_shaped}), 2, {}),
+    "flat": ("sarsa", (HOUSE, {**SLIPPERY, "wrapper": wrap.FlattenToDiscrete}), 2, {}),
+    "bins": ("qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, trainings.LESS),
+    "tiles": ("semi_gradient_q", ("CartPole-v1", {}), 1, {**SWING, **trainings.LESS}),
     # Episodes of 82 steps, more than there is room for at first.
-    left_at_first = {"initial_preferences": [1.47, -1.47], "learning_rate": 0.002}
-    yield "reinforce", "reinforce", ("ShortCorridor-v0", {}), 2, left_at_first
+    "long": ("reinforce", ("ShortCorridor-v0", {}), 2,
+        {"initial_preferences": [1.47, -1.47], "learning_rate": 0.002}),
     # That all agents keep to masks is seen in test_masks.py, where steps are interpreted.
-    masked = {"mask_actions": True}
-    tiny = HOUSE, {"desc": ["S.", "#G"], "max_episode_steps": 5}
-    noise = {**masked, **trainings.NOISE, "initial_q_std": 5.0}
-    yield "noise masked", "sarsa", tiny, 1, noise
-    yield "masked", "dyna_q_plus", ("Taxi-v4", {"wrapper": wrap.ActionMasks}), 2, masked
-
-
-ROWS = {row[0]: row[1:] for row in rows()}
+    "noise masked": ("sarsa", (HOUSE, {"desc": ["S.", "#G"], "max_episode_steps": 5}), 1,
+        {**MASKED, **trainings.NOISE, "initial_q_std": 5.0}),
+    "masked": ("dyna_q_plus", ("Taxi-v4", {"wrapper": wrap.ActionMasks}), 2, MASKED),
+}  # fmt: skip
 
 
 def in_world(name, place, n_envs=1, folder=None, **settings):
@@ -325,28 +310,13 @@ def test_an_environment_of_ones_own_ends_in_the_same_bits_if_it_draws_as_toy_tex
         load_algorithm("value_iteration")(env=calm()).learn(10)
 
 
-class Liar(gym.Env):
-    """Shows what is not in its space, at the start or after a step."""
-
-    observation_space, action_space = spaces.Discrete(4), spaces.Discrete(2)
-
-    def __init__(self, at_start=0, after_step=0):
-        self.at_start, self.after_step = at_start, after_step
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.at_start, {}
-
-    def step(self, action):
-        return self.after_step, 1.0, False, False, {}
-
-
 @pytest.mark.parametrize("name", ["qlearning", "epsilon_greedy"])
 def test_an_observation_outside_of_the_space_is_refused(name):
     """Compiled code would read and write beside the table."""
     for outside in (4, 10**9, -1):
         for shown in ((outside, 0), (0, outside)):
-            model = load_algorithm(name)(env=Liar(*shown), seed=0)
+            env = trainings.Unknown(spaces.Discrete(4), None, *shown, ends=0)
+            model = load_algorithm(name)(env=env, seed=0)
             with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
                 model.learn(5)
 

@@ -1,6 +1,8 @@
 """One table of agents, each with settings other than its own, and what can be compared of them."""
 
+import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
@@ -82,6 +84,24 @@ class Every(BlockCallback):
 
     def _on_step(self):
         return self.n_calls % self.calls != 0 or self.do(self.model) is not False
+
+
+class Unknown(gym.Env):
+    """An environment of any spaces without a model, which may show what is not in them."""
+
+    def __init__(self, observations=None, actions=None, first=None, shown=None, ends=0.1):
+        self.observation_space = observations or spaces.Box(-1, 1, (2,), np.float32)
+        self.action_space = actions or spaces.Discrete(2)
+        self.first, self.shown, self.ends = first, shown, ends
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample() if self.first is None else self.first, {}
+
+    def step(self, action):
+        obs = self.observation_space.sample() if self.shown is None else self.shown
+        return obs, 0.5, bool(self.np_random.random() < self.ends), False, {}
 
 
 def environment(env_id, n_envs=1, seed=3, wrapper=None, folder=None, **env_kwargs):
