@@ -58,17 +58,16 @@ def test_sample_averages():
     assert scores(model).tolist() == [5.0, 3.0, 5.0]
 
 
-@pytest.mark.parametrize(
-    ("name", "pulls", "settings", "expected"),
-    [
-        ("epsilon_greedy", [(1, 1)], {"exploration_initial_eps": 0.3}, [0.1, 0.8, 0.1]),
-        ("epsilon_greedy", [(1, 1)], {"exploration_initial_eps": 0.0}, [0, 1, 0]),
-        # By the softmax of 1, 3 and 2.
-        ("boltzmann", [(0, 0.1), (1, 0.3), (2, 0.2)], {"temperature": 0.1},
-         np.exp([1, 3, 2]) / np.exp([1, 3, 2]).sum()),
-    ],
-    ids=["epsilon", "greedy", "softmax"],
-)  # fmt: skip
+SHARES = [
+    ("epsilon_greedy", [(1, 1)], {"exploration_initial_eps": 0.3}, [0.1, 0.8, 0.1]),
+    ("epsilon_greedy", [(1, 1)], {"exploration_initial_eps": 0.0}, [0, 1, 0]),
+    # By the softmax of 1, 3 and 2.
+    ("boltzmann", [(0, 0.1), (1, 0.3), (2, 0.2)], {"temperature": 0.1},
+     np.exp([1, 3, 2]) / np.exp([1, 3, 2]).sum()),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "pulls", "settings", "expected"), SHARES)
 def test_how_often_each_arm_is_pulled(name, pulls, settings, expected):
     """Of 20,000 draws four standard errors are at most .014."""
     assert shares(taught(name, pulls, **settings)) == pytest.approx(expected, abs=0.014)

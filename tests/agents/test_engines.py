@@ -10,11 +10,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import ClipReward, TimeLimit
-from stable_baselines3.common.callbacks import (
-    CallbackList,
-    EveryNTimesteps,
-    StopTrainingOnMaxEpisodes,
-)
+from stable_baselines3.common import callbacks as sb3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -140,24 +136,16 @@ def test_schedules_by_episodes():
     assert models[0]._current_progress_remaining == pytest.approx(0.0, abs=0.01)
 
 
-def put(**attributes):
-    def change(model):
-        for name, value in attributes.items():
-            setattr(model, name, value)
-
-    return change
-
-
 def put_zeros(model):
     parameters = model.get_parameters()["policy"]
     model.set_parameters({"policy": {key: value * 0 for key, value in parameters.items()}})
 
 
 CHANGES = {
-    "gamma": put(gamma=0.3),
-    "sample averages": put(learning_rate="sample_average"),
-    "epsilon": put(exploration_schedule=FloatSchedule(0.9)),
-    "generator": lambda model: setattr(model, "rng", np.random.default_rng(5)),
+    "gamma": lambda model: vars(model).update(gamma=0.3),
+    "sample averages": lambda model: vars(model).update(learning_rate="sample_average"),
+    "epsilon": lambda model: vars(model).update(exploration_schedule=FloatSchedule(0.9)),
+    "generator": lambda model: vars(model).update(rng=np.random.default_rng(5)),
     "zeros that are loaded": put_zeros,
 }
 
@@ -176,12 +164,6 @@ def set_pole(env):
     vars(env.unwrapped).update(gravity=1.62, force_mag=3.0, kinematics_integrator="semi-implicit")
 
 
-def shorten(env):
-    while not isinstance(env, TimeLimit):
-        env = env.env
-    vars(env)["_max_episode_steps"] = 7
-
-
 BY_HAND = {  # an agent, a world, and what is done to it between two trainings
     "an outcome in place": (
         "sarsa", WORLDS["lake"],
@@ -189,7 +171,8 @@ BY_HAND = {  # an agent, a world, and what is done to it between two trainings
     "a tile": (
         "sarsa", WORLDS["house"],
         lambda env: env.unwrapped.dynamics.tiles.update({ord("#"): Tile(-7, blocked=True)})),
-    "the time limit": ("sarsa", WORLDS["lake"], shorten),
+    "the time limit": (
+        "sarsa", WORLDS["lake"], lambda env: env.set_wrapper_attr("_max_episode_steps", 7)),
     "a pole on the moon": ("semi_gradient_q", ("CartPole-v1", {}), set_pole),
 }  # fmt: skip
 
@@ -211,10 +194,6 @@ def test_a_change_of_the_environment_by_hand_counts_and_for_it_alone(what):
     assert not all(map(th.equal, *states))
 
 
-class Foreign(gym.Wrapper):
-    """Nobody knows what it does."""
-
-
 def lake(**kwargs):
     return make_vec_env("FrozenLake-v1", 1, seed=0, **kwargs)
 
@@ -233,7 +212,7 @@ def calm():
 
 INTERPRETED = {  # reason: environment, settings, callback
     "VecNormalize is not DummyVecEnv": (lambda: VecNormalize(lake(), norm_obs=False),),
-    "the environment's transition model is not known": (partial(lake, wrapper_class=Foreign),),
+    "the environment's transition model is not known": (partial(lake, wrapper_class=gym.Wrapper),),
     "rewards are drawn, and the environment's model": (partial(gym.make, "MaximizationBias-v0"),),
     "the environments are not alike": (
         lambda: DummyVecEnv([lambda: gym.make(LAKE), lambda: gym.make(LAKE, is_slippery=False)]),),
@@ -247,7 +226,8 @@ INTERPRETED = {  # reason: environment, settings, callback
     "schedule is a Python function": (lake, {"learning_rate": lambda progress: 0.1 * progress}),
     "ConvertCallback must be asked after each step": (lake, {}, lambda: lambda local, _: True),
     "Plain must be asked after each step$": (
-        lake, {}, lambda: [CallbackList([trainings.Plain()]), StopTrainingOnMaxEpisodes(5)]),
+        lake, {},
+        lambda: [sb3.CallbackList([trainings.Plain()]), sb3.StopTrainingOnMaxEpisodes(5)]),
 }  # fmt: skip
 
 
@@ -273,7 +253,7 @@ def test_the_engine_that_was_asked_for():
         in_use.append(model.learn(10).engine_in_use)
     assert in_use == ["interpreted: asked for", "compiled", "compiled"]
     plain = trainings.Plain()
-    model.learn(1_000, callback=EveryNTimesteps(100, plain))
+    model.learn(1_000, callback=sb3.EveryNTimesteps(100, plain))
     assert (model.engine_in_use, plain.n_calls) == ("compiled", 10)
 
 

@@ -22,9 +22,7 @@ def assert_close(found, expected):
 def textbook_table(table, steps, end, n, ahead, backed_up):
     """The table after an episode that ends in state 0, by the boxes of chapter 7.
 
-    Args:
-        ahead: value of (table, state, action), where a target ends.
-        backed_up: value of (table, state, action, later return), where it goes on.
+    A target ends in a value ``ahead``, and goes through values ``backed_up`` from later ones.
     """
     table, total = np.array(table, dtype=float), len(steps)
     for time in range(total + n - 1):

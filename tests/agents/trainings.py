@@ -19,7 +19,6 @@ COOLING = {"exploration": "boltzmann", "temperature": LinearSchedule(5.0, 0.2, 0
 NOISE = {"exploration": "gaussian_noise", "noise_std": 20.0}
 AVERAGE, LESS = {"learning_rate": "sample_average"}, {"learning_rate": LinearSchedule(0.8, 0.1, 1)}
 DECAYING, FIRST = {"learning_rate": ExponentialSchedule(0.8, 0.01)}, {"tie_breaking": "first"}
-LATE = {"batch_size": 7}  # feedback comes in batches
 AGENTS = {  # where each is tried, and with which settings
     "qlearning": (LAKE, {**CONSTANT, **FIRST, "learning_rate": 0.5, "mask_actions": False}),
     "sarsa": (LAKE, {**FALLING, **AVERAGE, "initial_q_std": 1.0}),
@@ -113,9 +112,8 @@ def environment(env_id, n_envs=1, seed=3, wrapper=None, folder=None, **env_kwarg
 
 
 def make(name, env, **settings):
-    """An agent of the default policy in an environment, or in one of that id."""
+    """An agent of the default policy."""
     algorithm = load_algorithm(name)
-    env = environment(env) if isinstance(env, str) else env
     return algorithm(next(iter(algorithm.policy_aliases)), env, **{"seed": 1, **settings})
 
 
