@@ -247,7 +247,7 @@ LOG = Path(__file__).parents[1] / "envs" / "uniform_log.csv"
     ("env_id", "kwargs", "numbers"),
     [
         # At the end of the episode, what is there comes in.
-        (SEGMENTS, {"batch_size": 3, "pulls": 7}, [0, 0, 3, 3, 3, 6, 7]),
+        (SEGMENTS, {"batch_size": 3, "max_episode_steps": 7}, [0, 0, 3, 3, 3, 6, 7]),
         (COINS, {}, [1, 2, 3, 4]),
         # What the log does not tell of is passed over.
         ("ReplayBandit-v0", {"log": str(LOG)}, [1, 1, 2, 3, 4, 5, 6]),
