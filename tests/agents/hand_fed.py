@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.algorithm import Transitions
@@ -35,9 +36,9 @@ class Told:
         self.agent = kind(env=Spaces(observations, n_actions), **{"seed": 0, **settings})
         self.agent._begin_episodes()
 
-    def step(self, obs, action, reward, next_obs, end=""):
+    def step(self, *step):
         """As `feed`."""
-        feed(self.agent, obs, action, reward, next_obs, end)
+        feed(self.agent, *step)
 
     @property
     def committed(self):
@@ -57,48 +58,26 @@ class Fed(Told):
         self.agent.policy.q_tables.numpy()[:] = table
         self.table = self.agent.policy.q_tables.numpy()[0]
 
-    def step(self, obs, action, reward, next_obs, end=""):
+    def step(self, *step):
         """As above; returns the table."""
-        super().step(obs, action, reward, next_obs, end)
+        super().step(*step)
         return self.table.copy()
 
-    def episode(self, steps, end):
-        """Learn from steps (obs, action, reward), the last of which leads to state 0."""
-        following = [*(step[0] for step in steps[1:]), 0]
-        ends = [*[""] * (len(steps) - 1), end]
-        return [self.step(*step, *to) for step, *to in zip(steps, following, ends, strict=True)]
+    def episode(self, steps, end, commits=False):
+        """Learn from steps (obs, action, reward), the last of which leads to state 0.
 
-    def committed_episode(self, steps, end):
-        """As `episode`, but after the first step it does what it has committed to.
-
-        Returns:
-            The steps as they were taken.
+        Returns them as taken: after the first one it may do what it has committed to.
         """
-        taken = []
+        taken, following = [], [*(step[0] for step in steps[1:]), 0]
         for k, (obs, action, reward) in enumerate(steps):
-            taken.append((obs, action if k == 0 else self.committed, reward))
-            is_last = k == len(steps) - 1
-            self.step(*taken[-1], 0 if is_last else steps[k + 1][0], end if is_last else "")
+            taken.append((obs, self.committed if k and commits else action, reward))
+            self.step(*taken[-1], following[k], end if k == len(steps) - 1 else "")
         return taken
 
 
 ENDS = st.sampled_from(["terminated", "truncated"])
 SHARES = st.floats(0.0, 1.0, width=16)
-REWARDS = st.integers(-3, 3)
+# Tables of whole numbers, among which ties are common; and lists of (obs, action, reward).
+TABLES = hnp.arrays(int, (N_STATES, N_ACTIONS), elements=st.integers(-2, 4))
 STATES, ACTIONS = st.integers(0, N_STATES - 1), st.integers(0, N_ACTIONS - 1)
-
-
-def tables():
-    """Tables of whole numbers, among which ties are common."""
-    rows = st.lists(st.integers(-2, 4), min_size=N_ACTIONS, max_size=N_ACTIONS)
-    return st.lists(rows, min_size=N_STATES, max_size=N_STATES)
-
-
-def episodes(max_size=8):
-    """Lists of (obs, action, reward)."""
-    return st.lists(st.tuples(STATES, ACTIONS, REWARDS), min_size=1, max_size=max_size)
-
-
-def greedy(table, obs):
-    """The first best action."""
-    return int(np.argmax(table[obs]))
+EPISODES = st.lists(st.tuples(STATES, ACTIONS, st.integers(-3, 3)), min_size=1, max_size=8)

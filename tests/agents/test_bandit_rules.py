@@ -1,6 +1,7 @@
 """The rules of the bandit agents, on updates that were worked by hand and on closed forms."""
 
 import math
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -9,8 +10,7 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.env_checker import check_env
-from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.env_util import make_vec_env
 
 import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick.agents import load_algorithm
@@ -58,17 +58,16 @@ def test_sample_averages():
     assert scores(model).tolist() == [5.0, 3.0, 5.0]
 
 
-@pytest.mark.parametrize(
-    ("name", "pulls", "settings", "expected"),
-    [
-        ("epsilon_greedy", [(1, 1)], {"exploration_initial_eps": 0.3}, [0.1, 0.8, 0.1]),
-        ("epsilon_greedy", [(1, 1)], {"exploration_initial_eps": 0.0}, [0, 1, 0]),
-        # By the softmax of 1, 3 and 2.
-        ("boltzmann", [(0, 0.1), (1, 0.3), (2, 0.2)], {"temperature": 0.1},
-         np.exp([1, 3, 2]) / np.exp([1, 3, 2]).sum()),
-    ],
-    ids=["epsilon", "greedy", "softmax"],
-)  # fmt: skip
+SHARES = [
+    ("epsilon_greedy", [(1, 1)], {"exploration_initial_eps": 0.3}, [0.1, 0.8, 0.1]),
+    ("epsilon_greedy", [(1, 1)], {"exploration_initial_eps": 0.0}, [0, 1, 0]),
+    # By the softmax of 1, 3 and 2.
+    ("boltzmann", [(0, 0.1), (1, 0.3), (2, 0.2)], {"temperature": 0.1},
+     np.exp([1, 3, 2]) / np.exp([1, 3, 2]).sum()),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "pulls", "settings", "expected"), SHARES)
 def test_how_often_each_arm_is_pulled(name, pulls, settings, expected):
     """Of 20,000 draws four standard errors are at most .014."""
     assert shares(taught(name, pulls, **settings)) == pytest.approx(expected, abs=0.014)
@@ -76,19 +75,19 @@ def test_how_often_each_arm_is_pulled(name, pulls, settings, expected):
 
 L6, L7 = math.log(6), math.log(7)
 INDICES = [  # after 6 pulls: UCB1 takes 2 ln 6, Sutton and Barto the logarithm of the seventh
-    ({}, [0.5 + math.sqrt(2 * L6 / 4), 1 + math.sqrt(2 * L6)]),
-    ({"c": 0.1}, [0.5 + 0.1 * math.sqrt(2 * L6 / 4)]),
-    ({"variant": "sutton_barto"}, [0.5 + 2 * math.sqrt(L7 / 4), 1 + 2 * math.sqrt(L7)]),
-    ({"variant": "sutton_barto", "c": 1.0}, [0.5 + math.sqrt(L7 / 4)]),
+    ({}, 2 * L6, 1.0),
+    ({"c": 0.1}, 2 * L6, 0.1),
+    ({"variant": "sutton_barto"}, L7, 2.0),
+    ({"variant": "sutton_barto", "c": 1.0}, L7, 1.0),
 ]
 
 
-@pytest.mark.parametrize(("kwargs", "indices"), INDICES)
-def test_ucb_index(kwargs, indices):
+@pytest.mark.parametrize(("kwargs", "logarithm", "width"), INDICES)
+def test_ucb_index(kwargs, logarithm, width):
     model = agent("ucb", **kwargs)
-    own = model.width, model.is_textbook
-    values = [rules.ucb_index(0.5, 4, 6, *own), rules.ucb_index(1.0, 1, 6, *own)]
-    assert values[: len(indices)] == pytest.approx(indices, rel=1e-15)
+    for mean, count in ((0.5, 4), (1.0, 1)):
+        index = rules.ucb_index(mean, count, 6, model.width, model.is_textbook)
+        assert index == pytest.approx(mean + width * math.sqrt(logarithm / count), rel=1e-15)
 
 
 @pytest.mark.parametrize("name", ["ucb", "kl_ucb"])
@@ -241,83 +240,57 @@ def test_one_hot_contexts_are_averages_with_a_ridge():
 
 
 COINS, NORMAL, SEGMENTS = "BernoulliBandit-v0", "GaussianBandit-v0", "SegmentBandit-v0"
-
-
-class Script(gym.Env):
-    """Tells the given infos one after the other; the reward is 1 for arm 1."""
-
-    observation_space, action_space = spaces.Discrete(1), spaces.Discrete(2)
-
-    def __init__(self, infos):
-        self.infos, self.steps = infos, 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return 0, {}
-
-    def step(self, action):
-        self.steps += 1
-        return 0, float(action), False, self.steps == len(self.infos), self.infos[self.steps - 1]
-
-
-def told(key, values):
-    return [{key: bool(value)} for value in values]
+LOG = Path(__file__).parents[1] / "envs" / "uniform_log.csv"
 
 
 @pytest.mark.parametrize(
-    ("infos", "numbers"),
+    ("env_id", "kwargs", "numbers"),
     [
         # At the end of the episode, what is there comes in.
-        (told("feedback_due", [0, 0, 1, 0, 1, 1, 0]), [0, 0, 3, 3, 5, 6, 7]),
-        ([{}] * 4, [1, 2, 3, 4]),
-        (told("matched", [1, 0, 0, 1]), [1, 1, 1, 2]),
+        (SEGMENTS, {"batch_size": 3, "max_episode_steps": 7}, [0, 0, 3, 3, 3, 6, 7]),
+        (COINS, {}, [1, 2, 3, 4]),
+        # What the log does not tell of is passed over.
+        ("ReplayBandit-v0", {"log": str(LOG)}, [1, 1, 2, 3, 4, 5, 6]),
     ],
 )
-def test_what_is_learnt_after_each_pull(infos, numbers):
-    env = Script(infos)
-    check_env(env, skip_render_check=True)
-    model, found = load_algorithm("ucb")(env=Monitor(env), seed=0), []
-    for _ in infos:
+def test_what_is_learnt_after_each_pull(env_id, kwargs, numbers):
+    env, found = make_vec_env(env_id, seed=0, env_kwargs=kwargs), []
+    model = load_algorithm("ucb")(env=env, seed=0, tie_breaking="first")
+    for _ in numbers:
         model.learn(1, reset_num_timesteps=False)
         found.append(int(model.policy.counts.sum()))
     assert found == numbers
     assert model._n_updates == numbers[-1]
-    assert model.num_timesteps == len(infos)
+    assert model.num_timesteps == len(numbers)
 
 
 def test_rewards_that_do_not_fit():
-    shifted = gym.wrappers.TransformReward(Script([{}] * 9), lambda reward: reward + 0.5)
-    line = "Thompson as it is set learns from rewards that are 0 or 1, not"
-    with pytest.raises(ValueError, match=line):
-        load_algorithm("thompson")(env=Monitor(shifted), seed=0).learn(50)
-    with pytest.raises(ValueError, match="this environment's have normal noise"):
-        load_algorithm("thompson")(env=NORMAL, seed=0).learn(1)
+    shifted = gym.wrappers.TransformReward(gym.make(COINS), lambda reward: reward + 0.5)
+    for env, line in (
+        (shifted, "Thompson as it is set learns from rewards that are 0 or 1, not"),
+        (NORMAL, "this environment's have normal noise"),
+    ):
+        with pytest.raises(ValueError, match=line):
+            load_algorithm("thompson")(env=env, seed=0).learn(1)
 
 
 COIN, VECTORS = (COINS, {}), ("LinearBandit-v0", {})
 SEGMENTED = SEGMENTS, {"batch_size": 7, "pulls": 240}
 DRIFTING = NORMAL, {"drift_std": 0.1, "n_arms": 4, "means": [0, 0, 0, 0]}
-FALLING = {
-    "learning_rate": 0.1,
-    "initial_q": 2.0,
-    "exploration_decay": "exponential",
-    "exploration_initial_eps": 0.9,
-    "tie_breaking": "first",
-}
-COVERED = [
-    ("epsilon_greedy", FALLING, [DRIFTING]),
-    ("boltzmann", {"temperature": 0.2}, [SEGMENTED]),
-    ("ucb", {"variant": "sutton_barto", "tie_breaking": "first"}, [SEGMENTED]),
-    ("kl_ucb", {}, [COIN]),
-    ("gradient_bandit", {"baseline": False, "ignore_context": True}, [SEGMENTED]),
-    ("exp3", {}, [SEGMENTED]),
-    ("thompson", {}, [SEGMENTED]),
-    ("linucb", {}, [VECTORS]),
-    ("lin_thompson", {"alpha": 0.3, "tie_breaking": "first"}, [VECTORS]),
-    ("lin_epsilon_greedy", {"exploration_decay": "linear"}, [COIN]),
+FALLING = {"exploration_decay": "exponential", "exploration_initial_eps": 0.9}
+FALLING |= {"learning_rate": 0.1, "initial_q": 2.0, "tie_breaking": "first"}
+CASES = [
+    ("epsilon_greedy", FALLING, *DRIFTING),
+    ("boltzmann", {"temperature": 0.2}, *SEGMENTED),
+    ("ucb", {"variant": "sutton_barto", "tie_breaking": "first"}, *SEGMENTED),
+    ("kl_ucb", {}, *COIN),
+    ("gradient_bandit", {"baseline": False, "ignore_context": True}, *SEGMENTED),
+    ("exp3", {}, *SEGMENTED),
+    ("thompson", {}, *SEGMENTED),
+    ("linucb", {}, *VECTORS),
+    ("lin_thompson", {"alpha": 0.3, "tie_breaking": "first"}, *VECTORS),
+    ("lin_epsilon_greedy", {"exploration_decay": "linear"}, *COIN),
 ]
-CASES = [(name, kwargs, *world) for name, kwargs, worlds in COVERED for world in worlds]
 ARRAYS = ("seeds", "arms", "rewards", "regrets", "contexts", "estimates", "coefficients")
 
 
@@ -335,8 +308,7 @@ def test_a_batch_is_its_runs_one_by_one(name, kwargs, env_id, env_kwargs):
 
 
 def test_posteriors_at_some_moments():
-    args = ("thompson", {}, COINS, {})
-    result = run_batch(*args, range(3), moments=(100, 10, 5000))
+    result = run_batch("thompson", {}, COINS, {}, range(3), moments=(100, 10, 5000))
     assert result.moments == (10, 100, 1000)
     assert result.posteriors.shape == (3, 3, 1, 3, 2)
     for index, moment in enumerate(result.moments):
@@ -345,21 +317,21 @@ def test_posteriors_at_some_moments():
             wins, pulls = np.bincount(arms, rewards, minlength=3), np.bincount(arms, minlength=3)
             expected = np.stack([1 + wins, 1 + pulls - wins], axis=1)
             assert result.posteriors[run, index, 0].tolist() == expected.tolist()
-    assert run_batch(*args, [0], moments=()).moments == (1000,)
+    assert run_batch("thompson", {}, COINS, {}, [0], moments=()).moments == (1000,)
     assert run_batch("ucb", {}, COINS, {}, [0]).posteriors is None
 
 
-REFUSED = [
-    ("ucb", {}, "FrozenLake-v1", {}, "there is no compiled copy of FrozenLakeEnv"),
-    ("ucb", {}, COINS, {"pulls": 1001}, "pulls must lie between 1 and 1000, an episode, not 1001"),
-    ("thompson", {}, NORMAL, {}, "rewards that are 0 or 1, and this environment's have"),
-]
-
-
-@pytest.mark.parametrize(("name", "kwargs", "env_id", "more", "line"), REFUSED)
-def test_what_cannot_be_compiled_is_refused(name, kwargs, env_id, more, line):
+@pytest.mark.parametrize(
+    ("name", "env_id", "pulls", "line"),
+    [
+        ("ucb", "FrozenLake-v1", None, "there is no compiled copy of FrozenLakeEnv"),
+        ("ucb", COINS, 1001, "pulls must lie between 1 and 1000, an episode, not 1001"),
+        ("thompson", NORMAL, None, "rewards that are 0 or 1, and this environment's have"),
+    ],
+)
+def test_what_cannot_be_compiled_is_refused(name, env_id, pulls, line):
     with pytest.raises((NotCompilable, ValueError), match=line):
-        run_batch(name, kwargs, env_id, {}, [0], **more)
+        run_batch(name, {}, env_id, {}, [0], pulls)
 
 
 @pytest.mark.parametrize(

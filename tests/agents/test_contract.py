@@ -14,17 +14,8 @@ import torch as th
 
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from rl_yardstick.agents.common.model_files import JsonAlgorithm
-from tests.agents.trainings import (
-    AGENTS,
-    LAKE,
-    LATE,
-    SEGMENTS,
-    Plain,
-    assert_same,
-    environment,
-    state_of,
-)
-from tests.agents.trainings import make as make_in
+from tests.agents import trainings
+from tests.agents.trainings import AGENTS, LAKE, Plain, assert_same, environment, state_of
 
 PLANNING = {"value_iteration", "policy_iteration", "optimal"}
 ALL = pytest.mark.parametrize("name", AGENTS)
@@ -32,15 +23,15 @@ ALL = pytest.mark.parametrize("name", AGENTS)
 
 def env_of(name, n_envs=2, seed=5):
     env_id, _ = AGENTS[name]
-    late = LATE if env_id == SEGMENTS and "mabwiser" not in name else {}
-    return environment(env_id, n_envs, seed, **late)
+    is_late = env_id == trainings.SEGMENTS and "mabwiser" not in name
+    return environment(env_id, n_envs, seed, **({"batch_size": 7} if is_late else {}))
 
 
 def make(name, env=None, **settings):
     """Interpreted, as compiling takes long: that both loops agree is seen in `test_engines.py`."""
     has_engines = "engine" in inspect.signature(load_algorithm(name)).parameters
     engine = {"engine": "interpreted"} if has_engines else {}
-    return make_in(name, env or env_of(name), **{**AGENTS[name][1], **engine, **settings})
+    return trainings.make(name, env or env_of(name), **{**AGENTS[name][1], **engine, **settings})
 
 
 def steady(name):

@@ -10,11 +10,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import ClipReward, TimeLimit
-from stable_baselines3.common.callbacks import (
-    CallbackList,
-    EveryNTimesteps,
-    StopTrainingOnMaxEpisodes,
-)
+from stable_baselines3.common import callbacks as sb3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -53,38 +49,23 @@ def both_shaped(env):
     return wrap.TerminationReward(ClipReward(wrap.ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
 
 
-def rows():
-    """Each agent as the contract has it, in one of the worlds; and wrappers, vectors, masks."""
-    numbers, places = itertools.cycle((1, 3, 8)), itertools.cycle(WORLDS)
-    for name in TABULAR:
-        place = next(places)
-        yield f"{name} {place}", name, WORLDS[place], next(numbers), trainings.AGENTS[name][1]
-    for name in TILED:
-        env_id, settings = trainings.AGENTS[name]
-        yield f"{name} {env_id}", name, (env_id, {}), 2, settings
-    for wrapper in (both_shaped, wrap.FlattenToDiscrete):
-        slippery = HOUSE, {**SLIPPERY, "wrapper": wrapper}
-        yield f"under {wrapper.__name__}", "sarsa", slippery, 2, {"learning_rate": 0.3}
-    yield "bins of CartPole", "qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, trainings.LESS
-    yield (
-        "tiles of CartPole",
-        "semi_gradient_q",
-        ("CartPole-v1", {}),
-        1,
-        {**SWING, **trainings.LESS},
-    )
+AGENTS, MASKED = trainings.AGENTS, {"mask_actions": True}
+TURNS = zip(TABULAR, itertools.cycle(WORLDS), itertools.cycle((1, 3, 8)))
+ROWS = {  # each agent as the contract has it, in one of the worlds; and wrappers, vectors, masks
+    **{f"{name} {place}": (name, WORLDS[place], n, AGENTS[name][1]) for name, place, n in TURNS},
+    **{name: (name, (AGENTS[name][0], {}), 2, AGENTS[name][1]) for name in TILED},
+    "under three": ("sarsa", (HOUSE, {**SLIPPERY, "wrapper": both_shaped}), 2, {}),
+    "flat": ("sarsa", (HOUSE, {**SLIPPERY, "wrapper": wrap.FlattenToDiscrete}), 2, {}),
+    "bins": ("qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, trainings.LESS),
+    "tiles": ("semi_gradient_q", ("CartPole-v1", {}), 1, {**SWING, **trainings.LESS}),
     # Episodes of 82 steps, more than there is room for at first.
-    left_at_first = {"initial_preferences": [1.47, -1.47], "learning_rate": 0.002}
-    yield "reinforce", "reinforce", ("ShortCorridor-v0", {}), 2, left_at_first
+    "long": ("reinforce", ("ShortCorridor-v0", {}), 2,
+        {"initial_preferences": [1.47, -1.47], "learning_rate": 0.002}),
     # That all agents keep to masks is seen in test_masks.py, where steps are interpreted.
-    masked = {"mask_actions": True}
-    tiny = HOUSE, {"desc": ["S.", "#G"], "max_episode_steps": 5}
-    noise = {**masked, **trainings.NOISE, "initial_q_std": 5.0}
-    yield "noise masked", "sarsa", tiny, 1, noise
-    yield "masked", "dyna_q_plus", ("Taxi-v4", {"wrapper": wrap.ActionMasks}), 2, masked
-
-
-ROWS = {row[0]: row[1:] for row in rows()}
+    "noise masked": ("sarsa", (HOUSE, {"desc": ["S.", "#G"], "max_episode_steps": 5}), 1,
+        {**MASKED, **trainings.NOISE, "initial_q_std": 5.0}),
+    "masked": ("dyna_q_plus", ("Taxi-v4", {"wrapper": wrap.ActionMasks}), 2, MASKED),
+}  # fmt: skip
 
 
 def in_world(name, place, n_envs=1, folder=None, **settings):
@@ -155,24 +136,16 @@ def test_schedules_by_episodes():
     assert models[0]._current_progress_remaining == pytest.approx(0.0, abs=0.01)
 
 
-def put(**attributes):
-    def change(model):
-        for name, value in attributes.items():
-            setattr(model, name, value)
-
-    return change
-
-
 def put_zeros(model):
     parameters = model.get_parameters()["policy"]
     model.set_parameters({"policy": {key: value * 0 for key, value in parameters.items()}})
 
 
 CHANGES = {
-    "gamma": put(gamma=0.3),
-    "sample averages": put(learning_rate="sample_average"),
-    "epsilon": put(exploration_schedule=FloatSchedule(0.9)),
-    "generator": lambda model: setattr(model, "rng", np.random.default_rng(5)),
+    "gamma": lambda model: vars(model).update(gamma=0.3),
+    "sample averages": lambda model: vars(model).update(learning_rate="sample_average"),
+    "epsilon": lambda model: vars(model).update(exploration_schedule=FloatSchedule(0.9)),
+    "generator": lambda model: vars(model).update(rng=np.random.default_rng(5)),
     "zeros that are loaded": put_zeros,
 }
 
@@ -191,12 +164,6 @@ def set_pole(env):
     vars(env.unwrapped).update(gravity=1.62, force_mag=3.0, kinematics_integrator="semi-implicit")
 
 
-def shorten(env):
-    while not isinstance(env, TimeLimit):
-        env = env.env
-    vars(env)["_max_episode_steps"] = 7
-
-
 BY_HAND = {  # an agent, a world, and what is done to it between two trainings
     "an outcome in place": (
         "sarsa", WORLDS["lake"],
@@ -204,7 +171,8 @@ BY_HAND = {  # an agent, a world, and what is done to it between two trainings
     "a tile": (
         "sarsa", WORLDS["house"],
         lambda env: env.unwrapped.dynamics.tiles.update({ord("#"): Tile(-7, blocked=True)})),
-    "the time limit": ("sarsa", WORLDS["lake"], shorten),
+    "the time limit": (
+        "sarsa", WORLDS["lake"], lambda env: env.set_wrapper_attr("_max_episode_steps", 7)),
     "a pole on the moon": ("semi_gradient_q", ("CartPole-v1", {}), set_pole),
 }  # fmt: skip
 
@@ -226,10 +194,6 @@ def test_a_change_of_the_environment_by_hand_counts_and_for_it_alone(what):
     assert not all(map(th.equal, *states))
 
 
-class Foreign(gym.Wrapper):
-    """Nobody knows what it does."""
-
-
 def lake(**kwargs):
     return make_vec_env("FrozenLake-v1", 1, seed=0, **kwargs)
 
@@ -248,7 +212,7 @@ def calm():
 
 INTERPRETED = {  # reason: environment, settings, callback
     "VecNormalize is not DummyVecEnv": (lambda: VecNormalize(lake(), norm_obs=False),),
-    "the environment's transition model is not known": (partial(lake, wrapper_class=Foreign),),
+    "the environment's transition model is not known": (partial(lake, wrapper_class=gym.Wrapper),),
     "rewards are drawn, and the environment's model": (partial(gym.make, "MaximizationBias-v0"),),
     "the environments are not alike": (
         lambda: DummyVecEnv([lambda: gym.make(LAKE), lambda: gym.make(LAKE, is_slippery=False)]),),
@@ -262,7 +226,8 @@ INTERPRETED = {  # reason: environment, settings, callback
     "schedule is a Python function": (lake, {"learning_rate": lambda progress: 0.1 * progress}),
     "ConvertCallback must be asked after each step": (lake, {}, lambda: lambda local, _: True),
     "Plain must be asked after each step$": (
-        lake, {}, lambda: [CallbackList([trainings.Plain()]), StopTrainingOnMaxEpisodes(5)]),
+        lake, {},
+        lambda: [sb3.CallbackList([trainings.Plain()]), sb3.StopTrainingOnMaxEpisodes(5)]),
 }  # fmt: skip
 
 
@@ -288,7 +253,7 @@ def test_the_engine_that_was_asked_for():
         in_use.append(model.learn(10).engine_in_use)
     assert in_use == ["interpreted: asked for", "compiled", "compiled"]
     plain = trainings.Plain()
-    model.learn(1_000, callback=EveryNTimesteps(100, plain))
+    model.learn(1_000, callback=sb3.EveryNTimesteps(100, plain))
     assert (model.engine_in_use, plain.n_calls) == ("compiled", 10)
 
 
@@ -325,28 +290,13 @@ def test_an_environment_of_ones_own_ends_in_the_same_bits_if_it_draws_as_toy_tex
         load_algorithm("value_iteration")(env=calm()).learn(10)
 
 
-class Liar(gym.Env):
-    """Shows what is not in its space, at the start or after a step."""
-
-    observation_space, action_space = spaces.Discrete(4), spaces.Discrete(2)
-
-    def __init__(self, at_start=0, after_step=0):
-        self.at_start, self.after_step = at_start, after_step
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.at_start, {}
-
-    def step(self, action):
-        return self.after_step, 1.0, False, False, {}
-
-
 @pytest.mark.parametrize("name", ["qlearning", "epsilon_greedy"])
 def test_an_observation_outside_of_the_space_is_refused(name):
     """Compiled code would read and write beside the table."""
     for outside in (4, 10**9, -1):
         for shown in ((outside, 0), (0, outside)):
-            model = load_algorithm(name)(env=Liar(*shown), seed=0)
+            env = trainings.Unknown(spaces.Discrete(4), None, *shown, ends=0)
+            model = load_algorithm(name)(env=env, seed=0)
             with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
                 model.learn(5)
 

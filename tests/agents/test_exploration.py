@@ -1,7 +1,5 @@
 """Action choice and schedules: exact where random numbers are given, counted where they are not."""
 
-import math
-
 import numpy as np
 import pytest
 import torch as th
@@ -27,10 +25,8 @@ def test_choices_by_given_numbers():
     assert explore.epsilon_greedy_action(VALUES, 0.3, 0.0, np.array([0.9, 0.99])) == 1
     # The cumulative probabilities are inverted, and do not overflow.
     values = np.log([1.0, 2.0, 5.0])
-    chosen = [
-        explore.boltzmann_action(values, 1.0, np.array([u])) for u in (0.0, 0.12, 0.13, 0.37, 0.38)
-    ]
-    assert chosen == [0, 0, 1, 1, 2]
+    draws = np.array([[0.0], [0.12], [0.13], [0.37], [0.38]])
+    assert [explore.boltzmann_action(values, 1.0, row) for row in draws] == [0, 0, 1, 1, 2]
     assert explore.boltzmann_action(np.array([1e6, 0.0]), 1e-3, np.array([0.999])) == 0
     # Noise is added to the values.
     draws = np.array([0.0, -1.0, 0.0, 1.5])
@@ -39,12 +35,10 @@ def test_choices_by_given_numbers():
 
 def test_a_temperature_that_has_fallen_to_0_is_the_limit():
     values, expected = np.array([1.0, 3.0, 3.0, 0.0]), [0.0, 0.5, 0.5, 0.0]
-    chosen = [explore.boltzmann_action(values, 0.0, np.array([u])) for u in (0.0, 0.49, 0.51, 0.99)]
-    assert chosen == [1, 1, 2, 2]
-    found = [
-        explore.action_probability(explore.BOLTZMANN, values, 0.0, 1.0, action)
-        for action in range(4)
-    ]
+    draws = np.array([[0.0], [0.49], [0.51], [0.99]])
+    assert [explore.boltzmann_action(values, 0.0, row) for row in draws] == [1, 1, 2, 2]
+    args = explore.BOLTZMANN, values, 0.0, 1.0
+    found = [explore.action_probability(*args, action) for action in range(4)]
     matrix = explore.action_probabilities(explore.BOLTZMANN, values[None], 0.0, random_ties=True)
     assert found == matrix[0].tolist() == expected
     assert explore.expected_value(explore.BOLTZMANN, values, 0.0) == 3.0
@@ -57,16 +51,13 @@ def test_a_temperature_that_has_fallen_to_0_is_the_limit():
     st.booleans(),
 )
 def test_expected_value_is_the_mean_under_the_probabilities(values, rate, strategy, random_ties):
-    probabilities = explore.action_probabilities(
-        strategy, values[None], rate, random_ties=random_ties
-    )[0]
+    args = strategy, values[None], rate
+    (probabilities,) = explore.action_probabilities(*args, random_ties=random_ties)
     assert probabilities.sum() == pytest.approx(1)
     mean = float(probabilities @ values)
     assert explore.expected_value(strategy, values, rate) == pytest.approx(mean, rel=1e-9, abs=1e-9)
-    ties = float(random_ties)
-    found = [
-        explore.action_probability(strategy, values, rate, ties, a) for a in range(len(values))
-    ]
+    args = strategy, values, rate, float(random_ties)
+    found = [explore.action_probability(*args, action) for action in range(len(values))]
     np.testing.assert_allclose(found, probabilities, rtol=1e-12, atol=1e-15)
 
 
@@ -81,14 +72,10 @@ def agent_of(values, **arguments):
 @pytest.mark.parametrize("rate", [0.2, 5.0])
 def test_probabilities_row_by_row(rate):
     """Values without ties, whose rows have their best in different places; and large ones."""
-    shape = 4, 4
-    values = np.random.default_rng(3).normal(size=shape) + 1e5 * np.arange(shape[0])[:, None]
-    softmax, epsilon = [], min(rate, 1.0)
-    greedy = np.full(shape, epsilon / shape[1])
-    for state, row in enumerate(values.tolist()):
-        greedy[state, row.index(max(row))] += 1 - epsilon
-        weights = [math.exp((value - row[0]) / rate) for value in row]
-        softmax.append([weight / sum(weights) for weight in weights])
+    values = np.random.default_rng(3).normal(size=(4, 4)) + 1e5 * np.arange(4)[:, None]
+    epsilon, weights = min(rate, 1.0), np.exp((values - values[:, :1]) / rate)
+    greedy = epsilon / 4 + (1 - epsilon) * np.eye(4)[values.argmax(axis=1)]
+    softmax = weights / weights.sum(axis=1)[:, None]
     agent = agent_of(values, exploration_initial_eps=epsilon, exploration_final_eps=epsilon)
     np.testing.assert_allclose(agent.action_probabilities(), greedy, rtol=0, atol=1e-15)
     agent = agent_of(values, exploration="boltzmann", temperature=rate)

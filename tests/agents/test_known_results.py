@@ -15,6 +15,7 @@ from rl_yardstick import mdp
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.envs.known_models import time_limit, transition_model
+from tests.mdp.test_random_models import deterministic
 
 N_SEEDS = 10
 
@@ -26,14 +27,7 @@ def made(name, env_id, seed=0, n_envs=1, env_kwargs=None, **settings):
 
 def test_policy_iteration_by_hand():
     """To stay in state 0 earns 1, in state 1 it earns 3; to go over earns nothing."""
-    next_state = np.array([[[0], [1]], [[1], [1]]])
-    model = mdp.TransitionModel(
-        prob=np.ones(next_state.shape),
-        next_state=next_state,
-        reward=np.array([[[1.0], [0.0]], [[3.0], [3.0]]]),
-        terminated=np.zeros(next_state.shape, dtype=bool),
-        initial=np.array([1.0, 0.0]),
-    )
+    model = deterministic([[0, 1], [1, 1]], [[1, 0], [3, 3]], np.zeros((2, 2)))
     plan = mdp.policy_iteration(model, 0.5)
     assert plan.values == pytest.approx([3, 6])
     assert plan.action_values[0] == pytest.approx([2.5, 3])

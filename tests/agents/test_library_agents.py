@@ -25,7 +25,7 @@ from rl_yardstick.agents.library import DeepQLearning, DoubleDQN, double_q_value
 from rl_yardstick.agents.planning import AngleAgent, RandomAgent
 from rl_yardstick.agents.random_search import ARS
 from rl_yardstick.envs.wrappers import ActionMasks
-from tests.agents.trainings import Every, Plain
+from tests.agents.trainings import Every, Plain, Unknown
 
 SETTINGS = {"learning_starts": 50, "train_freq": 4, "batch_size": 16, "buffer_size": 500, "seed": 0}
 
@@ -40,15 +40,9 @@ def test_target_by_hand():
     assert values.tolist() == [[-10.0], [-7.0]]
 
 
-@pytest.mark.parametrize(
-    ("discounts", "loss"),
-    [
-        # Errors -10 - 2 = -12 and 1 + 0.5 * 8 - 3 = 2: (144 + 4) / 2 / 2.
-        (None, 37.0),
-        # Returns of several steps bring their own discounts: 1 + 0.25 * 8 - 3 = 0.
-        (th.tensor([[0.25], [0.25]]), 36.0),
-    ],
-)
+# Errors -10 - 2 = -12 and 1 + 0.5 * 8 - 3 = 2: (144 + 4) / 2 / 2. Returns of several steps bring
+# their own discounts: 1 + 0.25 * 8 - 3 = 0.
+@pytest.mark.parametrize(("discounts", "loss"), [(None, 37.0), (th.full((2, 1), 0.25), 36.0)])
 def test_squared_loss_by_hand(discounts, loss):
     """Of a terminal transition and one that goes on; rewards are -10 and 1."""
     model = DeepQLearning("MlpPolicy", "FrozenLake-v1", gamma=0.5)
@@ -75,9 +69,9 @@ def test_where_it_is_dqn_to_the_bit(algorithm, env_id):
     assert th.equal(*weights)
 
 
-def ars(n_envs=1, env="CartPole-v1", **kwargs):
-    env = make_vec_env(env, n_envs, seed=0)
-    return ARS("LinearPolicy", env, **{"seed": 0, "n_delta": 2, **kwargs})
+def ars(n_envs=1, algorithm=ARS, **kwargs):
+    env = make_vec_env("CartPole-v1", n_envs, seed=0)
+    return algorithm("LinearPolicy", env, seed=0, n_delta=2, **kwargs)
 
 
 def test_a_budget_of_episodes_ends_the_search():
@@ -103,32 +97,9 @@ def test_what_was_loaded_goes_on_from_its_weights(tmp_path):
 
 
 def test_the_search_itself_is_the_librarys():
-    ours = ars().learn(200)
-    env = make_vec_env("CartPole-v1", 1, seed=0)
-    theirs = sb3_contrib.ARS("LinearPolicy", env, seed=0, n_delta=2).learn(200)
+    ours, theirs = ars().learn(200), ars(algorithm=sb3_contrib.ARS).learn(200)
     assert ours.num_timesteps == theirs.num_timesteps
     assert th.equal(ours.weights, theirs.weights)
-
-
-class Any(gym.Env):
-    """An environment of any spaces, whose model is not known."""
-
-    def __init__(self, observations=None, actions=None, shown=None, ends=0.1):
-        self.observation_space = observations or spaces.Box(-1, 1, (2,), np.float32)
-        self.action_space = actions or spaces.Discrete(2)
-        self.shown, self.ends = shown, ends
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.observation_space.seed(seed)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        obs = self.observation_space.sample() if self.shown is None else self.shown
-        return obs, 0.5, bool(self.np_random.random() < self.ends), False, {}
-
-
-N = 5000
 
 
 BOX = spaces.Box(np.array([-1, 0], np.float32), np.array([1, 10], np.float32))
@@ -141,17 +112,17 @@ NUMBERED = {  # a space: its shape, its options, and the number of the one that 
 
 @pytest.mark.parametrize("kind", NUMBERED)
 def test_random_actions_are_uniform_and_follow_the_seed(kind):
-    space, shape, n_options, number = NUMBERED[kind]
+    (space, shape, n_options, number), n = NUMBERED[kind], 5000
 
     def drawn():
-        agent = RandomAgent("RandomPolicy", Any(actions=space), seed=7)
-        return agent.predict(np.zeros((N, 2), np.float32), deterministic=False)[0]
+        agent = RandomAgent("RandomPolicy", Unknown(actions=space), seed=7)
+        return agent.predict(np.zeros((n, 2), np.float32), deterministic=False)[0]
 
     actions = drawn()
-    assert actions.shape == (N, *shape)
-    frequencies, share = np.bincount(number(actions), minlength=n_options) / N, 1 / n_options
+    assert actions.shape == (n, *shape)
+    frequencies, share = np.bincount(number(actions), minlength=n_options) / n, 1 / n_options
     # Four standard errors of a frequency.
-    np.testing.assert_allclose(frequencies, share, atol=4 * np.sqrt(share * (1 - share) / N))
+    np.testing.assert_allclose(frequencies, share, atol=4 * np.sqrt(share * (1 - share) / n))
     np.testing.assert_array_equal(drawn(), actions)
 
 
@@ -161,10 +132,6 @@ def test_the_cart_is_pushed_to_where_the_pole_leans():
     for angle, others in itertools.product((-0.2, -1e-6, 0.0, 1e-6, 0.2), (-2.0, 2.0)):
         action, _ = agent.predict(np.array([others, others, angle, others], np.float32))
         assert action == (1 if angle > 0 else 0)
-
-
-SMALL = {"buffer_size": 100, "learning_starts": 10}
-SHORT = {"n_steps": 32, "batch_size": 32}
 
 
 def lake():
@@ -189,19 +156,13 @@ PLANS = [
     ("ppo", AUTO, lake, None, FEW, "compiled"),
     ("double_dqn", {"engine": "compiled"}, lake, None, 1, "compiled"),
     # Not the steps count, but what is learnt from them.
-    (
-        "dqn",
-        {**AUTO, "learning_starts": LONG},
-        lambda: gym.make("CartPole-v1"),
-        None,
-        10_000,
-        TOO_SHORT,
-    ),
+    ("dqn", {**AUTO, "learning_starts": LONG}, lambda: gym.make("CartPole-v1"), None,
+     10_000, TOO_SHORT),
     # Callbacks move the environment to Python, and never the engine.
     ("double_dqn", {}, lake, lambda: Every(1000), LONG, "compiled"),
     ("double_dqn", {}, lake, Plain, LONG, f"{BRIDGED}Plain must be asked after each step"),
     ("double_dqn", {}, lake, lambda: [EpisodeBudget(10)], 10**12, TOO_SHORT),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("case", range(len(PLANS)))
@@ -223,16 +184,20 @@ REFUSALS = {  # reason: agent, environment, settings
         "dqn", lambda: ActionMasks(gym.make("Warehouse-v0")), {"mask_actions": True}),
     "actions are Box, not Discrete": ("ppo", lambda: gym.make("Pendulum-v1"), {}),
     "a network has a layer of Hardtanh": (
-        "ppo", Any, {"policy_kwargs": {"activation_fn": nn.Hardtanh}}),
-    "OwnDQN may do things in Python of its own": (OwnDQN, Any, {}),
-    "some of its parameters are frozen": ("ppo", Any, {}),
+        "ppo", Unknown, {"policy_kwargs": {"activation_fn": nn.Hardtanh}}),
+    "OwnDQN may do things in Python of its own": (OwnDQN, Unknown, {}),
+    "some of its parameters are frozen": ("ppo", Unknown, {}),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("reason", REFUSALS)
 def test_compiled_says_why_not_and_auto_falls_back(reason):
     name, env, settings = REFUSALS[reason]
-    settings = {"policy": "MlpPolicy", **(SHORT if name == "ppo" else {}), **settings}
+    settings = {
+        "policy": "MlpPolicy",
+        **({"n_steps": 32, "batch_size": 32} if name == "ppo" else {}),
+        **settings,
+    }
     algorithm = name if isinstance(name, type) else load_algorithm(name)
     model = algorithm(env=env(), engine="compiled", **settings)
     if "frozen" in reason:
@@ -248,18 +213,18 @@ def test_compiled_says_why_not_and_auto_falls_back(reason):
 @pytest.mark.parametrize(("name", "at_end"), [("dqn", True), ("ppo", False)])
 def test_states_that_networks_have_no_weights_for_are_refused(name, at_end):
     """Compiled code would read whatever lies behind the weights."""
-    model = made(name, Any(spaces.Discrete(3), shown=3, ends=float(at_end)), engine="compiled")
+    model = made(name, Unknown(spaces.Discrete(3), shown=3, ends=float(at_end)), engine="compiled")
     with pytest.raises(ValueError, match=r"observation 3 is not in Discrete\(3\)"):
         model.learn(100)
 
 
 def test_a_training_that_diverges_is_ended():
-    env = Any(shown=np.full(2, np.nan, np.float32), ends=0)
+    env = Unknown(shown=np.full(2, np.nan, np.float32), ends=0)
     for name in ("ppo", "a2c"):
         model = made(name, env, n_steps=64, engine="compiled")
         with pytest.raises(ValueError, match="training has diverged"):
             model.learn(100)
-    model = made("dqn", env, engine="compiled", **SMALL).learn(100)
+    model = made("dqn", env, engine="compiled", buffer_size=100, learning_starts=10).learn(100)
     assert all(bool(p.isnan().all()) for p in model.q_net.parameters())
 
 
@@ -285,12 +250,11 @@ for line in sys.stdin.read().splitlines():
 """
 
 
-def saved(name, folder, env=None, engine="compiled", asked=()):
+def saved(name, folder, env, asked=()):
     """A model after a training with a checkpoint, which has been saved."""
-    _, usual, settings = AGENTS[name]
-    model = made(name, make_vec_env(env or usual, seed=0), engine=engine, **settings)
+    model = made(name, make_vec_env(env, seed=0), engine="compiled", **AGENTS[name][2])
     model.learn(300, callback=[CheckpointCallback(200, folder), *asked]).save(folder / "after")
-    assert model.engine_in_use.startswith(engine)
+    assert model.engine_in_use.startswith("compiled")
     return model
 
 
@@ -301,7 +265,7 @@ def steps_of(model):
 def test_files_open_where_this_project_is_not(tmp_path):
     lines, expected = [], []
     for name, (kind, env, _) in AGENTS.items():
-        saved(name, tmp_path / name)
+        saved(name, tmp_path / name, env)
         for path in (tmp_path / name / "rl_model_200_steps.zip", tmp_path / name / "after.zip"):
             lines.append(f"{kind}|{path}|{env}")
             expected.append(f"{path}|True|True")
@@ -312,7 +276,7 @@ def test_files_open_where_this_project_is_not(tmp_path):
 
 @pytest.mark.parametrize(("name", "asked"), [("double_dqn", ()), ("ppo", (Plain,))])
 def test_files_go_on_in_either_engine(name, asked, tmp_path):
-    model = saved(name, tmp_path, "CartPole-v1", "compiled", [kind() for kind in asked])
+    model = saved(name, tmp_path, "CartPole-v1", [kind() for kind in asked])
     for engine in ("library", "compiled"):
         env = make_vec_env("CartPole-v1", seed=1)
         loaded = load_algorithm(name).load(tmp_path / "after", env, engine=engine)

@@ -115,64 +115,38 @@ def softmax(preferences):
     return weights / weights.sum(axis=-1, keepdims=True)
 
 
-class Layers:
-    """Three layers of two states, through which an episode goes: no state is met twice."""
-
-    discount = 0.9
-
-    def __init__(self, seed):
-        rng = np.random.default_rng(seed)
-        self.start = np.array([0.3, 0.7])
-        self.prob = rng.dirichlet([1, 1], size=(6, 2))  # of the two states of the next layer
-        self.reward = rng.normal(size=(6, 2))
-        self.preferences = rng.normal(size=(6, 2))
-        self.values = rng.normal(size=6)
-
-    def episodes(self):
-        """Every episode: its probability, and its states and actions."""
-        policy = softmax(self.preferences)
-        for sides in itertools.product((0, 1), repeat=3):
-            states = [2 * layer + side for layer, side in enumerate(sides)]
-            for actions in itertools.product((0, 1), repeat=3):
-                steps = list(zip(states, actions, strict=True))
-                prob = self.start[sides[0]] * np.prod([policy[step] for step in steps])
-                prob *= np.prod([self.prob[steps[t]][sides[t + 1]] for t in range(2)])
-                yield prob, steps
-
-    def gradient(self):
-        """By the policy gradient theorem: visits times gradients of pi times action values."""
-        policy, q = softmax(self.preferences), np.zeros((6, 2))
-        for state in range(5, -1, -1):
-            q[state] = self.reward[state]
-            if state < 4:
-                ahead = slice(2 * (state // 2) + 2, 2 * (state // 2) + 4)
-                values = (policy[ahead] * q[ahead]).sum(axis=1)
-                q[state] += self.discount * self.prob[state] @ values
-        visits = np.zeros(6)
-        visits[:2] = self.start
-        for state in range(4):
-            ahead = slice(2 * (state // 2) + 2, 2 * (state // 2) + 4)
-            visits[ahead] += self.discount * visits[state] * (policy[state] @ self.prob[state])
-        advantage = q - (policy * q).sum(axis=1, keepdims=True)
-        return visits[:, None] * policy * advantage
-
-
 @pytest.mark.parametrize("baseline", ["none", "value"])
 def test_the_mean_update_of_all_episodes_is_the_exact_gradient(baseline):
-    world, settings = Layers(seed=0), {"learning_rate": 0.25, "baseline": baseline}
-    told = Told("reinforce", spaces.Discrete(7), gamma=world.discount, **settings)
-    mean, total = np.zeros((6, 2)), 0.0
+    """Episodes lead through three layers of two states: returns times scores of all that was done.
+
+    No state is met twice.
+    """
+    rng, start, discount = np.random.default_rng(0), (0.3, 0.7), 0.9
+    onward = rng.dirichlet([1, 1], size=(6, 2))  # chances of the two states of the next layer
+    rewards, preferences, state_values = (rng.normal(size=shape) for shape in ((6, 2), (6, 2), 6))
+    settings = {"learning_rate": 0.25, "baseline": baseline}
+    told = Told("reinforce", spaces.Discrete(7), gamma=discount, **settings)
+    mean, gradient, total, policy = np.zeros((6, 2)), np.zeros((6, 2)), 0.0, softmax(preferences)
     weights, values = told.agent.policy.weights.numpy(), told.agent.policy.state_weights.numpy()
-    for prob, steps in world.episodes():
-        weights[:6], values[:6] = world.preferences, world.values[: 6 * len(values)]
-        for t, (state, action) in enumerate(steps):
-            following = steps[t + 1][0] if t < 2 else 6
-            reward = world.reward[state, action]
-            told.step(state, action, reward, following, "terminated" if t == 2 else "")
-        mean += prob * (weights[:6] - world.preferences)
-        total += prob
+    for sides in itertools.product((0, 1), repeat=3):
+        for actions in itertools.product((0, 1), repeat=3):
+            weights[:6], values[:6] = preferences, state_values[: 6 * len(values)]
+            prob, earned, scores = start[sides[0]], 0.0, np.zeros((6, 2))
+            for t, action in enumerate(actions):
+                state, is_last = 2 * t + sides[t], t == 2
+                following = 6 if is_last else 2 * t + 2 + sides[t + 1]
+                end, reward = "terminated" * is_last, rewards[state, action]
+                told.step(state, action, reward, following, end)
+                prob *= policy[state, action] * (
+                    1 if is_last else onward[state, action, sides[t + 1]]
+                )
+                earned += discount**t * reward
+                scores[state] = np.eye(2)[action] - policy[state]
+            mean += prob * (weights[:6] - preferences)
+            gradient += prob * earned * scores
+            total += prob
     assert total == pytest.approx(1, rel=1e-12)
-    np.testing.assert_allclose(mean / 0.25, world.gradient(), atol=1e-12)
+    np.testing.assert_allclose(mean / 0.25, gradient, atol=1e-12)
 
 
 def test_reinforce_by_hand():
@@ -255,54 +229,31 @@ def test_the_corridor_is_left_by_chance_and_defeats_bootstrapping(name, settings
 
 
 def test_a_step_of_one_goes_along_the_gradient_of_the_logarithm():
-    """Against central differences; tiles share the step, so that it is a third at each."""
+    """Tiles share the step, so that it is a third at each."""
     told = Told("reinforce", UNIT, 3, n_tilings=3, n_tiles=2, learning_rate=1.0)
     weights = told.agent.policy.weights.numpy()
     weights[:] = before = np.random.default_rng(0).normal(size=weights.shape)
-    obs, action, tiny = np.array([0.3, 0.8], "f4"), 2, 1e-6
-
-    def log_probability():
-        return np.log(softmax(told.agent.policy.sums(obs[None])))[0, action]
-
-    gradient = np.zeros_like(weights)
-    for place in np.ndindex(*weights.shape):
-        weights[place] += tiny
-        above = log_probability()
-        weights[place] -= 2 * tiny
-        gradient[place] = (above - log_probability()) / (2 * tiny)
-        weights[place] = before[place]
-    before = weights.copy()
+    obs, action, expected = np.array([0.3, 0.8], "f4"), 2, np.zeros_like(weights)
+    (tiles,) = active(make_tiles(UNIT, n_tilings=3, n_tiles=2), obs)
+    expected[tiles] = (np.eye(3)[action] - softmax(before[tiles].sum(axis=0))) / 3
     told.step(obs, action, 1.0, obs, "terminated")
-    np.testing.assert_allclose(weights - before, gradient / 3, atol=1e-9)
-    assert np.count_nonzero(np.abs(gradient) > 1e-6) == 3 * 3
+    np.testing.assert_allclose(weights - before, expected, atol=1e-9)
 
 
-TILINGS = st.fixed_dictionaries(
-    {
-        "n_tilings": st.integers(1, 16),
-        "n_tiles": st.lists(st.integers(1, 9), min_size=2, max_size=2),
-    }
-)
 PLACES = st.tuples(st.floats(-2, 2, width=32), st.floats(-0.125, 0.125, width=32))
 
 
-@given(TILINGS, PLACES, PLACES)
-def test_places_share_as_many_tiles_as_the_displacements_say(settings, first, second):
+@given(st.integers(1, 16), st.tuples(*[st.integers(1, 9)] * 2), PLACES, PLACES)
+def test_places_share_as_many_tiles_as_the_displacements_say(n, counts, first, second):
     """In rationals: tiling t has an edge every tile, displaced by (2 d + 1) t / n tiles."""
-    tiles = make_tiles(BOUNDS, **settings)
-    n, shared = settings["n_tilings"], 0
+    tiles, shared = make_tiles(BOUNDS, n_tilings=n, n_tiles=list(counts)), 0
+    sizes = BOUNDS.low.astype(float), tiles.dimensions["steps"], counts
     for t in range(n):
         cells = []
         for place in (first, second):
             steps = [
                 min(max(math.floor((x - low) * per_unit), 0), count * n - 1)
-                for x, low, per_unit, count in zip(
-                    place,
-                    BOUNDS.low.astype(float),
-                    tiles.dimensions["steps"],
-                    settings["n_tiles"],
-                    strict=True,
-                )
+                for x, low, per_unit, count in zip(place, *sizes, strict=True)
             ]
             cells.append([(step + t * (2 * d + 1) % n) // n for d, step in enumerate(steps)])
         shared += cells[0] == cells[1]

@@ -4,13 +4,16 @@ The library, made to draw the numbers that compiled code draws, agrees up to rou
 weight after every step. The others end in the same bits, wherever blocks of steps end.
 """
 
+import json
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
@@ -24,21 +27,18 @@ from rl_yardstick.envs.wrappers import OneHotObservation
 from tests.agents.trainings import Every, Plain
 
 TOLERANCE = 1e-4  # what rounding comes to after a few hundred steps
+STEPS = "time/total_timesteps"
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 ROLLOUT = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs")
 ROLLOUT += ("advantages", "returns")
 
 
-def lake(steps=6):
-    return gym.make("FrozenLake-v1", max_episode_steps=steps)
+LAKE = partial(gym.make, "FrozenLake-v1", max_episode_steps=6)
+POLE = partial(gym.make, "CartPole-v1", max_episode_steps=9)
 
 
-def vectors(steps=6):
-    return OneHotObservation(lake(steps))
-
-
-def pole(steps=9):
-    return gym.make("CartPole-v1", max_episode_steps=steps)
+def vectors():
+    return OneHotObservation(LAKE())
 
 
 class Matrices(gym.Env):
@@ -76,15 +76,15 @@ Q = {"learning_starts": 20, "buffer_size": 120, "batch_size": 8, "target_update_
 PPO = {"n_steps": 24, "batch_size": 16, "n_epochs": 2}
 BY_A_FUNCTION = {"clip_range": lambda remaining: 0.05 + 0.2 * remaining}
 CASES = {  # agent, environment, how many, episodes between two records, settings
-    "dqn": ("dqn", lake, 1, 3, Q),
+    "dqn": ("dqn", LAKE, 1, 3, Q),
     "two environments": (
-        "dqn", lake, 2, 3,
+        "dqn", LAKE, 2, 3,
         {**Q, "gradient_steps": -1, "tau": 0.5, **policy(net_arch=[])}),
-    "episodes": ("dqn", pole, 1, 3, {**Q, "train_freq": (2, "episode"), "gradient_steps": -1}),
+    "episodes": ("dqn", POLE, 1, 3, {**Q, "train_freq": (2, "episode"), "gradient_steps": -1}),
     "steps, greedy at once": (
         "dqn", vectors, 2, 3,
         {**Q, "n_steps": 3, "train_freq": 3, "gradient_steps": 2, "exploration_fraction": 0.0}),
-    "double, tau": ("double_dqn", pole, 2, 3, {**Q, "tau": 0.5}),
+    "double, tau": ("double_dqn", POLE, 2, 3, {**Q, "tau": 0.5}),
     "matrices": (
         "dqn", Matrices, 2, 3,
         {**Q, "n_steps": 3, "max_grad_norm": 0.1, "batch_size": 33,
@@ -92,34 +92,19 @@ CASES = {  # agent, environment, how many, episodes between two records, setting
     "ppo, normalised": ("ppo", Matrices, 2, 3, {**PPO, **BY_A_FUNCTION, "wrap": normalised}),
     "ppo, a remainder of one": (
         "ppo", vectors, 2, 1, {**PPO, "n_steps": 25, "batch_size": 7, "clip_range_vf": 0.1}),
-    "ppo on poles": ("ppo", pole, 2, 3, {**PPO, "target_kl": 0.003}),
+    "ppo on poles": ("ppo", POLE, 2, 3, {**PPO, "target_kl": 0.003}),
     "ppo by AdamW": (
         "ppo", Matrices, 1, 3,
         {**PPO, "normalize_advantage": False, **policy(th.optim.AdamW, weight_decay=3.0)}),
     "ppo, two networks": (
-        "ppo", pole, 1, 3,
+        "ppo", POLE, 1, 3,
         {**PPO, "max_grad_norm": 0.01, "ent_coef": 0.1,
          **policy(net_arch={"pi": [70, 1], "vf": []}, activation_fn=nn.ReLU)}),
     "a2c": (
-        "a2c", lake, 2, 1, {"gamma": 0.9, "gae_lambda": 0.8, **policy(net_arch=[64, 64])}),
+        "a2c", LAKE, 2, 1, {"gamma": 0.9, "gae_lambda": 0.8, **policy(net_arch=[64, 64])}),
     "a2c with decay": (
-        "a2c", pole, 1, 3, policy(RMSpropTFLike, eps=1e-5, weight_decay=0.1)),
+        "a2c", POLE, 1, 3, policy(RMSpropTFLike, eps=1e-5, weight_decay=0.1)),
 }  # fmt: skip
-
-
-class Lists(KVWriter):
-    """Keeps what is logged, but for times."""
-
-    def __init__(self):
-        self.dumps = []
-
-    def write(self, key_values, key_excluded, step=0):
-        times = ("time/fps", "time/time_elapsed")
-        kept = {k: v for k, v in sorted(key_values.items()) if k not in times}
-        self.dumps.append((step, kept))
-
-    def close(self):
-        pass
 
 
 class Diary(BlockCallback):
@@ -169,20 +154,13 @@ class RolloutDiary(Diary):
 
 def make(case, engine="compiled"):
     name, env, n_envs, _, settings = CASES[case]
-    wrap = settings.get("wrap", lambda env: env)
     settings = {"policy_kwargs": {"net_arch": [16]}, **settings}
-    settings.pop("wrap", None)
-    env, rate = wrap(make_vec_env(env, n_envs, seed=3)), LinearSchedule(1e-2, 1e-3, 0.8)
+    env, rate = (
+        settings.pop("wrap", lambda env: env)(make_vec_env(env, n_envs, seed=3)),
+        LinearSchedule(1e-2, 1e-3, 0.8),
+    )
     algorithm = load_algorithm(name)
     return algorithm("MlpPolicy", env, seed=5, engine=engine, learning_rate=rate, **settings)
-
-
-def learn(model, mode, steps, *callbacks, **kwargs):
-    """Train in compiled parts, or in the compiled loop where the environment has a model."""
-    model.learn(steps, callback=[*callbacks, *[Plain()] * (mode == "parts")], **kwargs)
-    assert mode != "compiled" or model.engine_in_use == "compiled"
-    assert mode != "parts" or model.engine_in_use.startswith("compiled but for")
-    return model
 
 
 def draw_as_compiled(patch, model, rng):
@@ -251,33 +229,33 @@ def assert_same(ours, theirs):
     assert [name for name in ours if not np.array_equal(ours[name], theirs[name])] == []
 
 
-def followed(case, engine, *callbacks):
+def followed(folder, case, engine, *callbacks):
     """A training that its diary, its log and its end tell of."""
-    model, lists = make(case, engine), Lists()
-    model.set_logger(Logger(None, [lists]))
+    model = make(case, engine)
+    model.set_logger(configure(str(folder), ["json"]))
     with pytest.MonkeyPatch.context() as patch:
         if engine == "library":
             draw_as_compiled(patch, model, model.rng)
         model.learn(303, callback=[*callbacks], log_interval=CASES[case][3])
     assert model.engine_in_use.startswith(engine)
-    return model, lists.dumps
+    model.logger.close()
+    records = map(json.loads, (folder / "progress.json").read_text().splitlines())
+    of_the_clock = {"time/fps", "time/time_elapsed"}
+    return model, [{k: r[k] for k in sorted(r.keys() - of_the_clock)} for r in records]
 
 
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 @pytest.mark.parametrize("case", CASES)
-def test_compiled_training_does_what_the_library_does_wherever_blocks_end(case):
+def test_compiled_training_does_what_the_library_does_wherever_blocks_end(case, tmp_path):
     theirs, ours, steps = RolloutDiary(), RolloutDiary(), Diary()
-    (library, expected), (model, dumps) = (
-        followed(case, "library", theirs, steps), followed(case, "compiled", ours)
-    )  # fmt: skip
+    library, expected = followed(tmp_path, case, "library", theirs, steps)
+    model, dumps = followed(tmp_path, case, "compiled", ours)
     assert ours.exact == theirs.exact
     for each, other in zip(ours.close, theirs.close, strict=True):
         np.testing.assert_allclose(each, other, rtol=TOLERANCE, atol=TOLERANCE)
-    names, others = ([(step, [*record]) for step, record in each] for each in (dumps, expected))
+    names, others = ([(r[STEPS], [*r]) for r in records] for records in (dumps, expected))
     assert names == others
-    logged, other = (
-        [v for _, record in each for v in record.values()] for each in (dumps, expected)
-    )
+    logged, other = ([v for r in records for v in r.values()] for records in (dumps, expected))
     np.testing.assert_allclose(logged, other, rtol=1e-3, atol=1e-4)
     assert len(dumps) > (5 if hasattr(model, "replay_buffer") else 1)
     ended, end = state(library), state(model)
@@ -287,27 +265,26 @@ def test_compiled_training_does_what_the_library_does_wherever_blocks_end(case):
     if CASES[case][1] is Matrices:
         return
     # In compiled environments too, whether blocks end after each step or learn within the loop.
-    rollouts = [(step, of_rollouts(record)) for step, record in dumps]
+    rollouts = [of_rollouts(record) for record in dumps]
     for callbacks in ([again := Diary()], [Every(7), Every(30)]):
-        model, found = followed(case, "compiled", *callbacks)
+        model, found = followed(tmp_path, case, "compiled", *callbacks)
         assert model.engine_in_use == "compiled"
         assert_same(state(model), end)
-        assert [(step, of_rollouts(record)) for step, record in found] == rollouts
+        assert [of_rollouts(record) for record in found] == rollouts
     assert again.exact == steps.exact
 
 
 def of_rollouts(record):
-    return {key: value for key, value in record.items() if key.startswith("rollout/")}
-
-
-MODES = ("parts", "compiled")
+    return {key: value for key, value in record.items() if key.startswith(("rollout/", STEPS))}
 
 
 @pytest.mark.parametrize("case", ["episodes", "ppo on poles"])
 def test_a_training_that_was_stopped_goes_on(case):
     ends = []
-    for mode in MODES:
-        model = learn(make(case), mode, 1000, Every(123, lambda model: False))
+    for plain in ([], [Plain()]):
+        model = make(case).learn(1000, callback=[*plain, Every(123, lambda model: False)])
         assert model.num_timesteps == 123 * model.n_envs
-        ends.append(state(learn(model, mode, 300, reset_num_timesteps=False)))
+        model.learn(300, callback=plain, reset_num_timesteps=False)
+        assert model.engine_in_use.startswith("compiled but for") == bool(plain)
+        ends.append(state(model))
     assert_same(*ends)

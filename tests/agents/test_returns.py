@@ -9,7 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.exploration import EPSILON_GREEDY, action_probabilities
-from tests.agents.hand_fed import ENDS, N_ACTIONS, N_STATES, SHARES, Fed, episodes, greedy, tables
+from tests.agents.hand_fed import ENDS, EPISODES, N_ACTIONS, N_STATES, SHARES, TABLES, Fed
 
 GAMMA, ALPHA = 0.75, 0.25
 USUAL = {"gamma": GAMMA, "learning_rate": ALPHA}
@@ -22,14 +22,12 @@ def assert_close(found, expected):
 def textbook_table(table, steps, end, n, ahead, backed_up):
     """The table after an episode that ends in state 0, by the boxes of chapter 7.
 
-    Args:
-        ahead: value of (table, state, action), where a target ends.
-        backed_up: value of (table, state, action, later return), where it goes on.
+    A target ends in a value ``ahead``, and goes through values ``backed_up`` from later ones.
     """
     table, total = np.array(table, dtype=float), len(steps)
     for time in range(total + n - 1):
         if time == total - 1:
-            last = 0, greedy(table, 0)
+            last = 0, table[0].argmax()
         start = time - n + 1
         if start < 0:
             continue
@@ -46,25 +44,25 @@ def textbook_table(table, steps, end, n, ahead, backed_up):
 
 
 @settings(max_examples=25)
-@given(table=tables(), steps=episodes(), end=ENDS, n=st.integers(1, 5))
+@given(table=TABLES, steps=EPISODES, end=ENDS, n=st.integers(1, 5))
 def test_n_step_sarsa(table, steps, end, n):
     fed = Fed("n_step_sarsa", table, n_steps=n, **USUAL)
     for _ in range(2):  # nothing is left over from the first episode
         before = fed.table.copy()
-        taken = fed.committed_episode(steps, end)
+        taken = fed.episode(steps, end, commits=True)
         values = lambda table, *place: table[place]  # noqa: E731
         later = lambda table, state, action, later: later  # noqa: E731
         assert_close(fed.table, textbook_table(before, taken, end, n, values, later))
 
 
 @settings(max_examples=25)
-@given(table=tables(), steps=episodes(), end=ENDS, n=st.integers(1, 5), epsilon=SHARES)
+@given(table=TABLES, steps=EPISODES, end=ENDS, n=st.integers(1, 5), epsilon=SHARES)
 @pytest.mark.parametrize("target_policy", ["exploring", "greedy"])
 def test_tree_backup(table, steps, end, n, epsilon, target_policy):
     def policy(table, state):
         if target_policy == "greedy":
             # Tied actions are worth the same: any share of them gives the same mean.
-            return np.eye(len(table[state]))[greedy(table, state)]
+            return np.eye(len(table[state]))[table[state].argmax()]
         return action_probabilities(EPSILON_GREEDY, table, epsilon, random_ties=False)[state]
 
     def mean(table, state, action):
@@ -110,17 +108,6 @@ def by_the_box(name, table, steps, end, decay, trace_type):
     return table
 
 
-def lambda_return(steps, values, decay, start, horizon):
-    """From step ``start``, with values of the states after each step, up to the horizon."""
-    total, discounted, weight = 0.0, 0.0, 1.0
-    for k in range(start, horizon):
-        discounted += GAMMA ** (k - start) * steps[k][2]
-        target = discounted + GAMMA ** (k - start + 1) * values[k]
-        total += weight * (1.0 if k == horizon - 1 else 1.0 - decay) * target
-        weight *= decay
-    return total
-
-
 def by_online_lambda_returns(name, table, steps, end, decay, step_sizes):
     """The table after an episode, all of whose updates, since a cut, are done anew each step."""
     now = np.array(table, dtype=float)
@@ -131,32 +118,27 @@ def by_online_lambda_returns(name, table, steps, end, decay, step_sizes):
         values.append(ahead(now, steps, k, end))
         now = start.copy()
         for j in range(first, k + 1):
-            error = lambda_return(steps, values, decay, j, k + 1) - now[steps[j][:2]]
-            now[steps[j][:2]] += step_sizes[j] * error
+            later = values[k]
+            for i in reversed(range(j, k + 1)):
+                later = steps[i][2] + GAMMA * (values[i] + decay * (later - values[i]))
+            now[steps[j][:2]] += step_sizes[j] * (later - now[steps[j][:2]])
     return now
 
 
-def taken_by(fed, name, steps, end):
-    if name == "sarsa_lambda":
-        return fed.committed_episode(steps, end)
-    fed.episode(steps, end)
-    return steps
-
-
 @settings(max_examples=25)
-@given(table=tables(), steps=episodes(), end=ENDS, decay=SHARES)
+@given(table=TABLES, steps=EPISODES, end=ENDS, decay=SHARES)
 @pytest.mark.parametrize("trace_type", ["accumulating", "replacing"])
 @pytest.mark.parametrize("name", TRACES)
 def test_traces_of_the_box(name, trace_type, table, steps, end, decay):
     fed = Fed(name, table, trace_type=trace_type, trace_decay=decay, **USUAL)
     for _ in range(2):
         before = fed.table.copy()
-        taken = taken_by(fed, name, steps, end)
+        taken = fed.episode(steps, end, commits=name == "sarsa_lambda")
         assert_close(fed.table, by_the_box(name, before, taken, end, decay, trace_type))
 
 
 @settings(max_examples=25)
-@given(table=tables(), steps=episodes(), end=ENDS, decay=SHARES)
+@given(table=TABLES, steps=EPISODES, end=ENDS, decay=SHARES)
 # With a step size of 3 traces become negative.
 @pytest.mark.parametrize("learning_rate", [ALPHA, 3.0, "sample_average"])
 @pytest.mark.parametrize("name", TRACES)
@@ -166,7 +148,7 @@ def test_dutch_traces_are_the_online_lambda_return(name, learning_rate, table, s
     counts = fed.agent.policy.visit_counts.numpy()[0]
     for _ in range(2):
         before, visits, sizes = fed.table.copy(), counts.copy(), []
-        taken = taken_by(fed, name, steps, end)
+        taken = fed.episode(steps, end, commits=name == "sarsa_lambda")
         for state, action, _ in taken:
             visits[state, action] += 1
             is_average = learning_rate == "sample_average"
@@ -175,7 +157,7 @@ def test_dutch_traces_are_the_online_lambda_return(name, learning_rate, table, s
 
 
 @settings(max_examples=25)
-@given(table=tables(), steps=episodes(), end=ENDS)
+@given(table=TABLES, steps=EPISODES, end=ENDS)
 @pytest.mark.parametrize("every_visit", [False, True])
 @pytest.mark.parametrize("learning_rate", [ALPHA, "sample_average"])
 def test_returns_after_visits(table, steps, end, every_visit, learning_rate):
@@ -196,47 +178,27 @@ def test_returns_after_visits(table, steps, end, every_visit, learning_rate):
     assert np.array_equal(fed.agent.policy.visit_counts.numpy()[0], visits)
 
 
-class Weighed(Fed):
-    """Off-policy Monte Carlo, which chooses by itself; or is told that it chose something."""
-
-    def __init__(self, table, epsilon, **settings):
-        super().__init__("off_policy_monte_carlo", table, epsilon, **settings)
-
-    def act(self, obs):
-        self.agent._last_obs = np.array([obs])
-        return int(self.agent._choose_actions()[0])
-
-    def tell(self, **fields):
-        """What the agent has noted of its last choice: action and probability."""
-        for name, value in fields.items():
-            self.agent._workspace_for(self.agent.rng, 1).fields[name][:] = value
-
-
 @settings(max_examples=25)
-@given(
-    table=tables(),
-    places=st.lists(st.integers(0, N_STATES - 1), min_size=1, max_size=8),
-    end=ENDS,
-    seed=st.integers(0, 1000),
-)
-def test_weighted_importance_sampling(table, places, end, seed):
+@given(table=TABLES, steps=EPISODES, end=ENDS, seed=st.integers(0, 1000))
+def test_weighted_importance_sampling(table, steps, end, seed):
     """The box of section 5.7, with the probabilities that the agent acts by."""
-    fed = Weighed(table, 0.8, gamma=GAMMA, seed=seed)  # off the greedy policy rather often
+    own = {"gamma": GAMMA, "seed": seed}
+    fed = Fed("off_policy_monte_carlo", table, 0.8, **own)  # often off the greedy policy
     expected, weights = fed.table.copy(), np.zeros_like(fed.table)
+    ends = [*(("", step[0]) for step in steps[1:]), (end, 0)]
     for _ in range(3):
-        policy, steps = fed.agent.action_probabilities(), []
+        policy, weight, taken = fed.agent.action_probabilities(), 1.0, []
         later = expected[0].max() if end == "truncated" else 0.0
-        for k, place in enumerate(places):
-            steps.append((place, fed.act(place), (k * 7) % 5 - 2))
-            is_last = k == len(places) - 1
-            fed.step(*steps[-1], 0 if is_last else places[k + 1], end if is_last else "")
-        weight = 1.0
-        for state, action, reward in reversed(steps):
+        for (state, _, reward), (ended, following) in zip(steps, ends, strict=True):
+            fed.agent._last_obs = np.array([state])  # from where it chooses by itself
+            taken.append((state, int(fed.agent._choose_actions()[0]), reward))
+            fed.step(*taken[-1], following, ended)
+        for state, action, reward in reversed(taken):
             later = reward + GAMMA * later
             weights[state, action] += weight
             share = weight / weights[state, action]
             expected[state, action] += share * (later - expected[state, action])
-            if action != greedy(expected, state):
+            if action != expected[state].argmax():
                 break
             weight /= policy[state, action]
         assert_close(fed.table, expected)
@@ -245,13 +207,14 @@ def test_weighted_importance_sampling(table, places, end, seed):
 
 def test_off_policy_monte_carlo_by_hand():
     """Epsilon is a half, so that a greedy action has a probability of 3/4, another one of 1/4."""
-    fed = Weighed(np.zeros((2, 2)), 0.5)
+    fed = Fed("off_policy_monte_carlo", np.zeros((2, 2)), 0.5)
     sums = fed.agent.policy.weights.numpy()[0]
+    noted = fed.agent._workspace_for(fed.agent.rng, 1).fields["probability"]  # of its last choice
 
     def learn(second_action, second_reward, second_probability):
-        fed.tell(probability=0.75)
+        noted[:] = 0.75
         fed.step(0, 0, 1, 1)
-        fed.tell(probability=second_probability)
+        noted[:] = second_probability
         return fed.step(1, second_action, second_reward, 0, "terminated").tolist()
 
     # What led to the end by an action that is the best one now counts four times.

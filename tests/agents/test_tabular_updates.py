@@ -127,7 +127,6 @@ def test_double_q_learning_judges_by_the_other_table():
         ((table, *place),) = np.argwhere(fed.agent.policy.visit_counts.numpy())
         assert place == [0, 1]
         values = fed.agent.policy.q_tables[:, 0, 1].tolist()
-        assert values == pytest.approx([*(FIRST_TABLE[0][1], SECOND_TABLE[0][1])], abs=2)
         assert values[table] == pytest.approx(expected[table], rel=1e-14)
         assert values[1 - table] == [10, 20][1 - table]
         met.add(table)

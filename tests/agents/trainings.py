@@ -1,6 +1,8 @@
 """One table of agents, each with settings other than its own, and what can be compared of them."""
 
+import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
@@ -17,7 +19,6 @@ COOLING = {"exploration": "boltzmann", "temperature": LinearSchedule(5.0, 0.2, 0
 NOISE = {"exploration": "gaussian_noise", "noise_std": 20.0}
 AVERAGE, LESS = {"learning_rate": "sample_average"}, {"learning_rate": LinearSchedule(0.8, 0.1, 1)}
 DECAYING, FIRST = {"learning_rate": ExponentialSchedule(0.8, 0.01)}, {"tie_breaking": "first"}
-LATE = {"batch_size": 7}  # feedback comes in batches
 AGENTS = {  # where each is tried, and with which settings
     "qlearning": (LAKE, {**CONSTANT, **FIRST, "learning_rate": 0.5, "mask_actions": False}),
     "sarsa": (LAKE, {**FALLING, **AVERAGE, "initial_q_std": 1.0}),
@@ -84,6 +85,24 @@ class Every(BlockCallback):
         return self.n_calls % self.calls != 0 or self.do(self.model) is not False
 
 
+class Unknown(gym.Env):
+    """An environment of any spaces without a model, which may show what is not in them."""
+
+    def __init__(self, observations=None, actions=None, first=None, shown=None, ends=0.1):
+        self.observation_space = observations or spaces.Box(-1, 1, (2,), np.float32)
+        self.action_space = actions or spaces.Discrete(2)
+        self.first, self.shown, self.ends = first, shown, ends
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample() if self.first is None else self.first, {}
+
+    def step(self, action):
+        obs = self.observation_space.sample() if self.shown is None else self.shown
+        return obs, 0.5, bool(self.np_random.random() < self.ends), False, {}
+
+
 def environment(env_id, n_envs=1, seed=3, wrapper=None, folder=None, **env_kwargs):
     """Environments under Monitor, which writes into the folder."""
     folder = None if folder is None else str(folder)
@@ -93,9 +112,8 @@ def environment(env_id, n_envs=1, seed=3, wrapper=None, folder=None, **env_kwarg
 
 
 def make(name, env, **settings):
-    """An agent of the default policy in an environment, or in one of that id."""
+    """An agent of the default policy."""
     algorithm = load_algorithm(name)
-    env = environment(env) if isinstance(env, str) else env
     return algorithm(next(iter(algorithm.policy_aliases)), env, **{"seed": 1, **settings})
 
 
