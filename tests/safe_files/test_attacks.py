@@ -74,7 +74,6 @@ ATTACKS = {
     "an array of gigabytes": name("numpy._core.multiarray", "_reconstruct")
     + name("numpy", "ndarray") + b"J\xff\xff\xff\x7f\x85C\x01b\x87R",
     "a key whose hash takes for ever": LAYERS + b"}" + TOP + b"K\x01s",
-    "a value that is huge once it is written out": LAYERS + TOP,
     "a length that is not there": b"\x8e\xff\xff\xff\xff\xff\xff\xff\x7f",
     "two states": CONSTANT + b")\x81}b}b",
     "the state of a name": name("builtins", "int") + b"}b",
@@ -342,6 +341,7 @@ BOMBS = {
     "a wide text": b"X" + struct.pack("<I", 16 * MB + 4) + b"a" * 16 * MB + b"\xf0\x9f\x98\x80.",
     "bytes that are not there": b"\x96" + (8 << 30).to_bytes(8, "little") + b".",
     "keys of one hash": b"}(" + LONGS + b"u.",
+    "a value that is huge once it is written out": LAYERS + TOP + b".",
     # What reading them takes just fits the budget.
     "dictionaries that just fit": b"](" + b"}K\x01Ns" * 90_000 + b"e.",
     "calls that just fit": DEQUE + b"\x940](" + b"h\x00)R" * 130_000 + b"e.",
