@@ -144,12 +144,9 @@ def preferences(make_env, seed, gamma, steps, *, fault=""):
         slope[action] += 1.0
         likes[obs] += (-0.1 if fault == "advantage-sign" else 0.1) * error * slope
         obs = env.reset()[0] if terminated or truncated else following
-
-    class ActorCritic(Agent):
-        def values(self, obs):
-            return v[[number(obs)]]
-
-    return ActorCritic(likes)
+    agent = Agent(likes)
+    agent.values = lambda obs: v[[number(obs)]]
+    return agent
 
 
 MEMORIES = {}

@@ -18,14 +18,6 @@ def outcomes(wind=0.3, goal_reward=9.0):
     return table
 
 
-def altered(row=(3, 1), **changes):
-    """P with the first outcome of one row changed."""
-    table = outcomes()
-    held = dict(zip(("prob", "state", "reward", "ends"), table[row[0]][row[1]][0], strict=True))
-    table[row[0]][row[1]][0] = tuple({**held, **changes}.values())
-    return table
-
-
 class Corridor(gym.Env):
     """Steps by ``true``, and tells ``P``; draws as toy_text does."""
 
@@ -41,7 +33,7 @@ class Corridor(gym.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.s = self.first()
+        self.s = int(categorical_sample([1.0, 0.0, 0.0, 0.0, 0.0], self.np_random))
         self.steps = 0
         return self.observe(), {}
 
@@ -50,9 +42,6 @@ class Corridor(gym.Env):
         _, self.s, reward, terminated = row[self.draw(row)]
         self.steps += 1
         return self.observe(), reward, terminated, False, {}
-
-    def first(self):
-        return int(categorical_sample([1.0, 0.0, 0.0, 0.0, 0.0], self.np_random))
 
     def draw(self, row):
         return categorical_sample([outcome[0] for outcome in row], self.np_random)
@@ -78,9 +67,3 @@ class Deaf(Corridor):
         result = super().step(action)
         self.place = self.s
         return result
-
-
-def with_p(told):
-    env = Corridor()
-    env.P = told
-    return env

@@ -43,15 +43,8 @@ def test_draws_of_gaussian_bandits(given_means, drift_std):
         env.reset()
 
 
-def draw_context(rng, n):
-    return [float(np.float32(2.0 * rng.random() - 1.0)) for _ in range(n)]
-
-
-def weighted_sum(weights, context):
-    total = weights[0] * context[0]
-    for weight, feature in zip(weights[1:], context[1:], strict=True):
-        total += weight * feature
-    return total
+def draw_context(rng):
+    return [float(np.float32(2.0 * rng.random() - 1.0)) for _ in range(9)]
 
 
 @pytest.mark.parametrize("redraws", [True, False])
@@ -67,15 +60,16 @@ def test_draws_of_linear_bandits(redraws):
             weights = [[rng.standard_normal() * scale for _ in range(9)] for _ in range(4)]
         assert env.arm_parameters.tolist() == weights
         for arm in arms_to_pull(100, 4):
-            context = draw_context(rng, 9)
+            context = draw_context(rng)
             assert shown.tolist() == context
-            expected = [weighted_sum(row, context) for row in weights]
+            # Summed from the first to the last.
+            expected = np.cumsum(np.multiply(weights, context), axis=1)[:, -1].tolist()
             shown, reward, _, _, info = env.step(arm)
             assert reward == expected[arm] + 0.5 * rng.standard_normal()
             assert info["expected_reward"] == expected[arm]
             assert info["regret"] == max(expected) - expected[arm]
             assert info["optimal_action"] == expected.index(max(expected))
-        draw_context(rng, 9)
+        draw_context(rng)
         shown, _ = env.reset()
 
 
@@ -121,28 +115,6 @@ def test_what_a_pooled_test_of_segments_loses_is_exact():
     assert known.success_outcomes(env) is None
 
 
-@pytest.fixture
-def write(tmp_path):
-    def written(text):
-        path = tmp_path / "log.csv"
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return written
-
-
-def test_a_log_with_a_context_of_text():
-    data = bandits.read_log(LOG)
-    assert (data.source, len(data), data.n_arms) == (str(LOG), 7, 2)
-    assert (data.context_names, data.categories) == (("segment",), ("casual", "core"))
-    assert data.contexts[:, 0].tolist() == [1, 0, 0, 1, 0, 1, 0]
-    assert data.arms.tolist() == [0, 1, 0, 1, 1, 0, 0]
-    assert data.rewards.tolist() == [1, 0, 1, 1, 0, 0, 0.25]
-    assert data.propensities.tolist() == [0.5] * 7
-    assert data.observation_space == spaces.Discrete(2)
-    assert data.observations(spaces.Discrete(2)).tolist() == [1, 0, 0, 1, 0, 1, 0]
-
-
 LOGS = {  # the text, names, contexts and arms; an observation space, and the observations
     # As a spreadsheet writes it: a mark in front, commas in names, and lines without anything.
     "any order": (
@@ -153,15 +125,16 @@ LOGS = {  # the text, names, contexts and arms; an observation space, and the ob
         "segment,arm,reward\n0,0,1\n1,0,1\n2,0,1\n1,0,1\n",
         ("segment",), [[0], [1], [2], [1]], [0] * 4, spaces.Discrete(3), [0, 1, 2, 1]),
     "no context": ("arm,reward\n3,1\n", (), [[]], [3], spaces.Discrete(1), [0]),
-    "words": ("arm,reward,word\n0,1,NA\n1,1,True \n", ("word",), [[0], [1]], [0, 1],
-        spaces.Discrete(2), [0, 1]),
+    "words": ("arm,reward,word\n0,1,True \n1,1,NA\n", ("word",), [[1], [0]], [0, 1],
+        spaces.Discrete(2), [1, 0]),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_logs_of_any_form(name, write):
+def test_logs_of_any_form(name, tmp_path):
     text, names, contexts, arms, space, observations = LOGS[name]
-    data = bandits.read_log(write(text))
+    (tmp_path / "log.csv").write_text(text, encoding="utf-8")
+    data = bandits.read_log(tmp_path / "log.csv")
     assert (data.context_names, data.contexts.tolist()) == (names, contexts)
     assert (data.arms.tolist(), data.n_arms, data.propensities) == (arms, max(arms) + 1, None)
     assert data.observation_space == space
@@ -222,7 +195,9 @@ def test_a_uniform_log_holds_what_the_environment_gave(env_id, kwargs, names, tm
 def test_replay_by_hand(tmp_path):
     with pytest.raises(ValueError, match=r"cannot read .*missing\.csv: No such file or directory"):
         gym.make("ReplayBandit-v0", log=str(tmp_path / "missing.csv"))
-    env = gym.make("ReplayBandit-v0", log=str(LOG))
+    data, env = bandits.read_log(LOG), gym.make("ReplayBandit-v0", log=str(LOG))
+    assert (data.source, len(data), data.categories) == (str(LOG), 7, ("casual", "core"))
+    assert data.rewards.tolist() == [1, 0, 1, 1, 0, 0, 0.25]
     assert (env.observation_space, env.action_space) == (spaces.Discrete(2), spaces.Discrete(2))
     assert (known.time_limit(env), known.transition_model(env)) == (7, None)
     # Context after the step, reward, matched, matched pulls so far; the arm pulled is always 0.
@@ -237,13 +212,15 @@ def test_replay_by_hand(tmp_path):
         env.unwrapped.step(1)
 
 
-def test_logs_that_were_not_uniform_are_refused(write):
+def test_logs_that_were_not_uniform_are_refused(tmp_path):
+    path = tmp_path / "log.csv"
     for text, message in (
         ("arm,reward\n0,1\n", "has no column 'propensity': replay needs one, each value the"),
         ("arm,reward,propensity\n0,1,0.5\n1,1,0.4\n", "the propensity of pull 2 is 0.4, not 0.5"),
     ):
+        path.write_text(text)
         with pytest.raises(ValueError, match=message):
-            bandits.ReplayBandit(write(text))
+            bandits.ReplayBandit(path)
     # Arms that were never pulled are known from the propensities.
-    log = write("arm,reward,propensity\n0,1,0.2\n2,0,0.2\n")
-    assert bandits.ReplayBandit(log).action_space == spaces.Discrete(5)
+    path.write_text("arm,reward,propensity\n0,1,0.2\n2,0,0.2\n")
+    assert bandits.ReplayBandit(path).action_space == spaces.Discrete(5)

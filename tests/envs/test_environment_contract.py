@@ -155,28 +155,16 @@ def test_arguments_out_of_range_are_refused(name, wrong, line):
     assert "\n" not in str(refused.value)
 
 
-class Showing(gym.Env):
-    """Shows what it is told to, for two steps of reward 1 and 2; the second one terminates."""
-
-    def __init__(self, space, shown=None):
-        self.observation_space = space
-        self.action_space = spaces.Discrete(2)
-        self.shown = shown
-        self.n_steps = 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.n_steps = 0
-        return self.shown, {}
-
-    def step(self, action):
-        self.n_steps += 1
-        return self.shown, float(self.n_steps), self.n_steps == 2, False, {}
+def showing(space, shown=None):
+    """Two steps of reward 1 and 2, all of which look the same."""
+    rewards = {"reward_schedule": (2, 0, 1), "is_slippery": False}
+    env = gym.make("FrozenLake-v1", desc=["SFG"], **rewards)
+    return gym.wrappers.TransformObservation(env, lambda _: shown, space)
 
 
-def box(low, high, shown=None):
+def box(low, high, shown):
     space = spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
-    return Showing(space, np.array(low if shown is None else shown, np.float32))
+    return showing(space, np.array(shown, np.float32))
 
 
 def cart_pole(**kwargs):
@@ -208,7 +196,7 @@ def test_bins_worked_by_hand():
     ],
 )
 def test_flattening_worked_by_hand(space, shown, n, index):
-    env = wrap.FlattenToDiscrete(Showing(space, shown))
+    env = wrap.FlattenToDiscrete(showing(space, shown))
     assert env.observation_space == spaces.Discrete(n)
     observed = [env.reset()[0], env.step(0)[0]]
     assert (observed, type(observed[0])) == ([index, index], int)
@@ -216,7 +204,7 @@ def test_flattening_worked_by_hand(space, shown, n, index):
 
 
 def test_one_hot_worked_by_hand():
-    env = wrap.OneHotObservation(Showing(spaces.Discrete(4, start=2), 3))
+    env = wrap.OneHotObservation(showing(spaces.Discrete(4, start=2), 3))
     assert env.observation_space == spaces.Box(0, 1, (4,), np.float32)
     for found in (env.reset()[0], env.step(0)[0]):
         assert (found.tolist(), found.dtype) == ([0, 1, 0, 0], np.float32)
@@ -229,19 +217,18 @@ def test_one_hot_worked_by_hand():
     [(9, False, [0.25, -10]), (9, True, [0.25, -10]), (1, False, [0.25]), (1, True, [-10])],
 )
 def test_rewards_are_scaled_and_the_last_one_is_replaced(limit, on_truncation, rewards):
-    inner = wrap.ScaleReward(TimeLimit(Showing(spaces.Discrete(2), 0), limit), scale=0.25)
+    inner = wrap.ScaleReward(TimeLimit(showing(spaces.Discrete(2), 0), limit), scale=0.25)
     env = wrap.TerminationReward(inner, reward=-10, on_truncation=on_truncation)
     env.reset()
-    assert [env.step(0)[1] for _ in rewards] == rewards
+    assert [env.step(2)[1] for _ in rewards] == rewards
 
 
-BOX, DISCRETE = spaces.Box(0, 1, (2,)), spaces.Discrete(2)
 MISTAKEN = [
     (lambda: cart_pole(low=None), "dimension 3 of the observation has the bounds -inf and 50.0: g"),
     (lambda: cart_pole(low=[1, -50]), "dimension 2 of .* has the bounds 1.0 and 0.418"),
     (lambda: cart_pole(bins=0), "bins must be whole numbers from 1 on, not 0"),
-    (lambda: wrap.FlattenToDiscrete(Showing(BOX)), "needs MultiDiscrete, a Tuple of"),
-    (lambda: wrap.ScaleReward(Showing(DISCRETE), 0), "scale must not be 0"),
+    (lambda: wrap.FlattenToDiscrete(gym.make("CartPole-v1")), "needs MultiDiscrete, a Tuple of"),
+    (lambda: wrap.ScaleReward(gym.make("CartPole-v1"), 0), "scale must not be 0"),
     (lambda: wrap.ActionMasks(gym.make("CartPole-v1")), "^CartPole-v1 has no action masks"),
     (lambda: wrap.IdleActionMasks(gym.make("CartPole-v1")), "needs an environment that holds P"),
 ]

@@ -34,50 +34,39 @@ def test_a_map_is_read_from_rows_text_and_files(tmp_path):
         assert grid_map.distances.tolist() == [2, 1, 0, 3, -1, 1, 4, 3, 2]
 
 
-BROKEN = [
+BROKEN = [  # in a file where it is bytes
     ([], "the map is empty"),
     (["S..", "..", "..G"], "row 2 has 2 cells, row 1 has 3"),
     (["...", "..G"], "the map has 0 starts S and 1 goals G, it must have one start, and a goal"),
     (["..S", "S.G"], "the map has 2 starts S and 1 goals G"),
     (["S..", "..."], "the map has 1 starts S and 0 goals G"),
     (["S..", ".é.", "..G"], "unknown letter 'é' at row 2, column 2; known are # . S G"),
-    (
-        ["S#.", "#..", "..G"],
-        "the goal at row 3, column 3 cannot be reached from the start at row 1",
-    ),
+    (["S#.", "#..", "..G"], "goal at row 3, column 3 cannot be reached from the start at row 1"),
     ("missing.txt", "cannot read the map file missing.txt: No such file or directory"),
     (["S" + "." * 5000 + "G"] * 5000, "has 25,010,000 cells, more than 16,777,216"),
+    (b"S.\n?G\n", r"map\.txt: unknown letter '\?' at row 2, column 1"),
+    (b"S.\xff\xfe.G", r"map\.txt: 'utf-8' codec can't decode byte"),
+]
+BROKEN_MAZES = [
+    (["S#G"], r"unknown letter '#' at row 1, column 2; known are S \. M P"),
+    (["SMG"], "the goal at row 1, column 3 cannot be reached"),
+    (["S" + "P" * 25 + "G"], r"has 27 cells, 25 of them to collect: these make 27 \* 2\*\*25"),
 ]
 
 
-@pytest.mark.parametrize(("desc", "message"), BROKEN, ids=[message for _, message in BROKEN])
-def test_a_broken_map_is_refused_in_one_line(desc, message):
+@pytest.mark.parametrize(("desc", "message"), BROKEN + BROKEN_MAZES)
+def test_a_broken_map_is_refused_in_one_line(desc, message, tmp_path):
+    kind = WarehouseEnv if (desc, message) in BROKEN else MineMazeEnv
+    if isinstance(desc, bytes):
+        (tmp_path / "map.txt").write_bytes(desc)
+        desc = tmp_path / "map.txt"
     with pytest.raises(ValueError, match=message) as refused:
-        WarehouseEnv(desc=desc)
+        kind(desc=desc)
     assert "\n" not in str(refused.value)
 
 
-def test_a_broken_map_in_a_file_is_refused_with_its_name(tmp_path):
-    path = tmp_path / "map.txt"
-    for content, message in (
-        (b"S.\n?G\n", r"map\.txt: unknown letter '\?' at row 2, column 1"),
-        (b"S.\xff\xfe.G", r"map\.txt: 'utf-8' codec can't decode byte"),
-    ):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=message):
-            WarehouseEnv(desc=path)
-
-
-def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
-    for desc, message in (
-        (["S#G"], r"unknown letter '#' at row 1, column 2; known are S \. M P"),
-        (["SMG"], "the goal at row 1, column 3 cannot be reached"),
-        (["S" + "P" * 25 + "G"], r"has 27 cells, 25 of them to collect: these make 27 \* 2\*\*25"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            MineMazeEnv(desc=desc)
+def test_a_maze_has_room_for_so_many_powers_and_the_nearest_goal_counts():
     assert MineMazeEnv(desc=["S" + "P" * 18 + "G"]).dynamics.n_states == 20 * 2**18
-    # Of several goals the nearest counts.
     assert WarehouseEnv(desc=["G..S.G", "......"]).shortest_path_length == 2
 
 
@@ -205,9 +194,7 @@ def test_a_seed_names_a_map_for_good():
 
 
 @pytest.mark.parametrize(
-    ("kwargs", "limit"),
-    [({"size": 50}, None), ({"max_episode_steps": 10**6}, 10**6)],
-    ids=["ten shortest ways", "longer"],
+    ("kwargs", "limit"), [({"size": 50}, None), ({"max_episode_steps": 10**6}, 10**6)]
 )
 def test_an_episode_is_limited_by_ten_shortest_ways_unless_it_is_said_otherwise(kwargs, limit):
     env = gym.make("envs:RandomWarehouse-v0", slip=0.1, **kwargs)

@@ -15,7 +15,7 @@ from rl_yardstick.envs import checking
 from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.checking import check_transition_model
 from rl_yardstick.envs.warehouse import WarehouseEnv
-from tests.envs.corridors import Backwards, Corridor, Deaf, altered, outcomes, with_p
+from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 
 # Where nothing is a question of frequencies, or these are far off.
 FEW = 5_000
@@ -53,20 +53,19 @@ def test_right_models_are_believed(name):
     assert (check.bit_for_bit, check.state_can_be_set) == (bit_for_bit, state_can_be_set)
 
 
-class Odd(Corridor):
-    def __init__(self, how):
-        self.how = how
-        super().__init__()
+def odd(kind=Corridor, **other):
+    """An environment with other methods and attributes than its class."""
+    return type("Odd", (kind,), other)()
 
-    def step(self, action):
-        obs, reward, terminated, truncated, info = super().step(action)
-        if self.how == "raises" and self.s == 3:
-            raise RuntimeError("one\ntwo")
-        truncated = self.how == "truncates" and self.steps == 20
-        return obs, reward, terminated, truncated, info
 
-    def observe(self):
-        return (0, self.s) if self.how == "pair" else self.s
+def truncates(env, action):
+    return *Corridor.step(env, action)[:3], env.steps == 20, {}
+
+
+def raises(env, action):
+    if env.s == 3:
+        raise RuntimeError("one\ntwo")
+    return Corridor.step(env, action)
 
 
 def ladder(reward):
@@ -78,16 +77,10 @@ def ladder(reward):
     return table
 
 
-def with_actions(n):
-    env = Corridor()
-    env.action_space = gym.spaces.Discrete(n)
-    return env
-
-
 LADDER = ladder(2.0), ladder(1.0), np.eye(16)[0]
 SAYS = r"^the environment's P is not what step does: state 3, action 1: P says state "
 FALSE = {
-    "reward": (lambda: Corridor(altered(reward=10.0)),
+    "reward": (lambda: Corridor(outcomes(goal_reward=10.0), outcomes()),
         rf"{SAYS}4 with reward 10\.0, terminated, it gave state 4 with reward 9\.0, terminated$"),
     "unknown wind": (lambda: Corridor(outcomes(wind=0.0)),
         r"state 3, action 0: P says state 2 with .* it gave state 1 with reward -1\.0$"),
@@ -97,13 +90,14 @@ FALSE = {
         lambda: Corridor(start=(0.9, 0.1, 0, 0, 0)), "initial_state_distrib"),
     "far away": (lambda: Corridor(*LADDER),
         r"state 15, action 1: P says state 15 with reward 2\.0"),
-    "truncates": (lambda: Odd("truncates"),
+    "truncates": (lambda: odd(step=truncates),
         "step gave truncated, which no model holds: leave time limits to max_episode_steps"),
-    "raises": (lambda: Odd("raises"), "against step, which raised RuntimeError: one two$"),
-    "pair": (lambda: Odd("pair"), r"the observation is \(0, 0\), not the number of a state"),
+    "raises": (lambda: odd(step=raises), "against step, which raised RuntimeError: one two$"),
+    "pair": (lambda: odd(observe=lambda env: (0, env.s)),
+        r"the observation is \(0, 0\), not the number of a state"),
     "a short outcome": (
-        lambda: with_p({0: {0: [(1.0,)]}}), "the environment's P is no model"),
-    "three actions": (lambda: with_actions(3),
+        lambda: Corridor({0: {0: [(1.0,)]}}), "the environment's P is no model"),
+    "three actions": (lambda: odd(action_space=gym.spaces.Discrete(3)),
         r"P is no model: it has 2 actions, where the space is Discrete\(3\)$"),
 }  # fmt: skip
 
@@ -120,33 +114,18 @@ def test_false_models_are_refused_in_one_line(name):
         assert check_transition_model(make(), n_steps) == check
 
 
-class Same(FrozenLakeEnv):
-    """Steps as its class does, by a method of its own."""
-
-    def step(self, action):
-        return super().step(action)
-
-
-class Frozen(FrozenLakeEnv):
-    def step(self, action):
-        return super().step(0)
-
-
-def replaced_by_hand():
-    env = FrozenLakeEnv()
-    original = env.step
-    env.step = lambda action: original(0)
-    return env
-
-
 def test_a_known_class_that_was_changed_is_not_believed_unless_it_does_the_same():
     tellers = known.transition_model, known.success_outcomes, known.observations_of_states
-    for env in (Frozen(), replaced_by_hand()):
+    stays = odd(FrozenLakeEnv, step=lambda env, action: FrozenLakeEnv.step(env, 0))
+    by_hand = FrozenLakeEnv()
+    by_hand.step = stays.step
+    for env in (stays, by_hand):
         assert [teller(env) for teller in tellers] == [None] * 3
-    assert "a method was replaced by hand" in known.model_check(env).refusal
-    ours, theirs = (known.transition_model(env) for env in (Same(), FrozenLakeEnv()))
+    assert "a method was replaced by hand" in known.model_check(by_hand).refusal
+    same = odd(FrozenLakeEnv, step=FrozenLakeEnv.step)
+    ours, theirs = (known.transition_model(env) for env in (same, FrozenLakeEnv()))
     np.testing.assert_array_equal(ours.prob, theirs.prob)
-    assert known.transition_model(type("Plain", (WarehouseEnv,), {})(slip=0.1)) is not None
+    assert known.transition_model(odd(WarehouseEnv)) is not None
 
 
 def test_the_caller_notices_nothing():

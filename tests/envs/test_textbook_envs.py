@@ -13,7 +13,7 @@ from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.compiled.worlds import NotCompilable, compile_envs
 from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.blackjack_model import blackjack_observations, natural_state, state_of
-from rl_yardstick.envs.textbook.racetrack import LEFT_TRACK
+from rl_yardstick.envs.pomdp import _hallway
 from rl_yardstick.envs.wrappers import FlattenToDiscrete
 
 
@@ -30,10 +30,11 @@ def optimal_values(env_id, **kwargs):
     return mdp.policy_iteration(model_of(env_id, **kwargs), 1.0).values
 
 
-def walk(env, actions):
-    """States and rewards of a walk, and whether its last step terminated."""
-    steps = [(*env.step(action)[:3], env.s) for action in actions]
-    return [step[3] for step in steps], [step[1] for step in steps], steps[-1][2]
+def chances(model, state, action):
+    """What may come of an action: the chance of each state, by its number."""
+    found = np.zeros(model.n_states)
+    np.add.at(found, model.next_state[state, action], model.prob[state, action])
+    return found
 
 
 def test_values_of_short_walks_are_those_of_the_book():
@@ -50,18 +51,9 @@ def test_the_second_state_of_the_corridor_alone_is_reversed():
     found = mdp.policy_return(env.transition_model(), np.tile([1 - p, p], (4, 1)), 20_000)
     assert found.expected_return == pytest.approx(-(4 - 2 * p) / (p * (1 - p)), rel=1e-9)
     env.reset(seed=0)
-    states = [0, 1, 0, 1, 2, 1, 0, 0, 1]
-    assert walk(env, [0, 1, 1, 1, 0, 0, 1, 0, 1]) == (states, [-1.0] * 9, False)
-    assert walk(env, [0, 1])[1:] == ([-1.0, -1.0], True)
-
-
-def next_by_hand(state, down, right, gust):
-    """A step as the book describes it, written out once more."""
-    wind = [0, 0, 0, 1, 1, 1, 2, 2, 1, 0]
-    row, column = state // 10, state % 10
-    if wind[column]:
-        row -= wind[column] + gust
-    return 10 * min(max(row + down, 0), 6) + min(max(column + right, 0), 9)
+    steps = [(env.step(action)[1:3], env.s) for action in (0, 1, 1, 1, 0, 0, 1, 0, 1, 0, 1)]
+    assert [state for _, state in steps[:-1]] == [0, 1, 0, 1, 2, 1, 0, 0, 1, 2]
+    assert [told for told, _ in steps] == [(-1.0, False)] * 10 + [(-1.0, True)]
 
 
 def test_the_shortest_ways_and_every_step_in_the_wind():
@@ -71,12 +63,12 @@ def test_the_shortest_ways_and_every_step_in_the_wind():
     moves = [(-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1), (0, 0)]
     assert model.n_actions == 9
     for state in set(range(70)) - {37}:
-        for action, move in enumerate(moves):
-            chances, by_hand = np.zeros(70), np.zeros(70)
-            np.add.at(chances, model.next_state[state, action], model.prob[state, action])
+        for action, (down, right) in enumerate(moves):
+            by_hand, wind = np.zeros(70), (0, 0, 0, 1, 1, 1, 2, 2, 1, 0)[state % 10]
             for gust in (-1, 0, 1):
-                by_hand[next_by_hand(state, *move, gust)] += 1 / 3
-            np.testing.assert_allclose(chances, by_hand, atol=1e-15)
+                row = state // 10 + down - (wind + gust if wind else 0)
+                by_hand[10 * min(max(row, 0), 6) + min(max(state % 10 + right, 0), 9)] += 1 / 3
+            np.testing.assert_allclose(chances(model, state, action), by_hand, atol=1e-15)
     assert (model.reward[np.arange(70) != 37] == -1).all()
 
 
@@ -152,25 +144,6 @@ def test_the_treasure_is_worth_99_hundredths(size, map_seed):
 COAST, FASTER_UP, SLOWER_UP, FASTER_RIGHT, SLOWER_RIGHT = 4, 7, 1, 5, 3
 
 
-def cells(rows):
-    """The cells of a track, by row and column."""
-    width = len(rows[0])
-    return [divmod(i, width) for i, letter in enumerate("".join(rows)) if letter != "#"]
-
-
-def outcomes(noise, start, action):
-    """What may come of an action: (row, column, up, right), terminated, by probability."""
-    env = gym.make("Racetrack-v0", noise=noise).unwrapped
-    model, found = env.transition_model(), {}
-    row, column, up, right = start
-    state = 25 * cells(LEFT_TRACK).index((row, column)) + 5 * up + right
-    columns = (model.prob, model.next_state, model.terminated)
-    for prob, after, ends in zip(*(each[state, action] for each in columns), strict=True):
-        key = (*cells(env.rows)[after // 25], after // 5 % 5, after % 5), bool(ends)
-        found[key] = found.get(key, 0) + prob
-    return {key: pytest.approx(prob) for key, prob in found.items() if prob > 0}
-
-
 def back_to_the_line(chance=1.0):
     return {((31, column, 0, 0), False): chance / 6 for column in range(3, 9)}
 
@@ -194,7 +167,16 @@ STEPS = [
 
 @pytest.mark.parametrize(("noise", "start", "action", "expected"), STEPS)
 def test_steps_of_the_racetrack(noise, start, action, expected):
-    assert outcomes(noise, start, action) == expected
+    """What may come of an action: (row, column, up, right), terminated, by probability."""
+    env = gym.make("Racetrack-v0", noise=noise).unwrapped
+    model, found, letters = env.transition_model(), {}, "".join(env.rows)
+    cells = [divmod(i, len(env.rows[0])) for i, letter in enumerate(letters) if letter != "#"]
+    at = 25 * cells.index(start[:2]) + 5 * start[2] + start[3], action
+    columns = model.prob[at], model.next_state[at], model.terminated[at]
+    for prob, after, ends in zip(*columns, strict=True):
+        key = (*cells[after // 25], after // 5 % 5, after % 5), bool(ends)
+        found[key] = found.get(key, 0) + prob
+    assert {key: prob for key, prob in found.items() if prob > 0} == pytest.approx(expected)
 
 
 def test_without_noise_the_race_takes_ten_steps_and_more():
@@ -276,10 +258,8 @@ def blackjack(rules):
 def test_the_optimum_is_the_one_that_is_published():
     for rules, published in PUBLISHED:
         model = blackjack(rules)
-        found = mdp.policy_return(
-            model, mdp.value_iteration(model, 1.0).policy, None
-        ).expected_return
-        assert found == pytest.approx(published, abs=5e-5)
+        found = mdp.policy_return(model, mdp.value_iteration(model, 1.0).policy, None)
+        assert found.expected_return == pytest.approx(published, abs=5e-5)
 
 
 def test_the_policy_is_that_of_figure_5_2():
@@ -309,64 +289,33 @@ def test_a_natural_looks_as_any_21_does_and_wins_are_successes():
     assert sorted(set(np.nonzero(paid)[0].tolist())) == [natural_state(up) for up in range(1, 11)]
 
 
-class Cheating(BlackjackEnv):
-    """Its steps may do anything."""
-
-
 def test_another_blackjack_is_not_believed_and_none_is_compiled():
-    changed = BlackjackEnv()
+    cheating, changed = type("Cheating", (BlackjackEnv,), {})(), BlackjackEnv()
     changed.step = lambda action: None
-    assert known.transition_model(Cheating()) is known.transition_model(changed) is None
+    assert known.transition_model(cheating) is known.transition_model(changed) is None
     agent = load_algorithm("qlearning")(env=FlattenToDiscrete(gym.make("Blackjack-v1")))
     with pytest.raises(NotCompilable, match="does not continue from the state"):
         compile_envs(agent.env)
-
-
-def chances(env_id, state, action, **kwargs):
-    """What may come of an action: the chance of each state, by its number."""
-    model = known.transition_model(gym.make(env_id, **kwargs))
-    found = np.zeros(model.n_states)
-    np.add.at(found, model.next_state[state, action], model.prob[state, action])
-    return found
 
 
 def test_the_tiger_is_heard_where_it_is_with_the_accuracy():
     env = gym.make("Tiger-v0", accuracy=0.8)
     model, heard = known.transition_model(env), known.observations_of_states(env)
     hidden = [env.unwrapped.cell_of(state) for state in range(6)]
-    assert list(zip(hidden, heard.tolist(), strict=True)) == [
-        (tiger, sound) for tiger in (0, 1) for sound in (0, 1, 2)
-    ]
-    np.testing.assert_allclose(model.initial, [0.5, 0, 0, 0.5, 0, 0])
+    assert (hidden, heard.tolist()) == ([0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 1, 2])
+    begins = [0.5, 0, 0, 0.5, 0, 0]
+    np.testing.assert_allclose(model.initial, begins)
     for state in range(6):
-        near, far = (0.8, 0.2) if hidden[state] == 0 else (0.2, 0.8)
-        expected = np.zeros(6)
-        expected[3 * hidden[state] + 1], expected[3 * hidden[state] + 2] = near, far
-        np.testing.assert_allclose(chances("Tiger-v0", state, 0, accuracy=0.8), expected)
-        for door in (1, 2):
-            np.testing.assert_allclose(chances("Tiger-v0", state, door), [0.5, 0, 0, 0.5, 0, 0])
+        listened = [0, 0.8, 0.2, 0, 0, 0] if state < 3 else [0, 0, 0, 0, 0.2, 0.8]
+        for action, expected in enumerate((listened, begins, begins)):
+            np.testing.assert_allclose(chances(model, state, action), expected)
     rewards = [[-1.0, -100.0, 10.0]] * 3 + [[-1.0, 10.0, -100.0]] * 3
     np.testing.assert_allclose(model.expected_reward, rewards)
-    best = mdp.finite_horizon_optimum(model, known.time_limit(env)).start_value
-    assert best == pytest.approx(100)
+    assert optimum_of("Tiger-v0") == pytest.approx(100)
 
 
 NORTH, EAST, SOUTH, WEST = range(4)
 STAY, FORWARD, RIGHT, AROUND, LEFT = range(5)
-
-
-def places(cell, action, facing):
-    """By cell and facing, the chances after an action; cells 0 to 10 are the row, then alcoves."""
-    from rl_yardstick.envs.pomdp import _hallway
-
-    world = _hallway()
-    state = int(np.flatnonzero(world.hidden == 4 * cell + facing)[0])
-    found = {}
-    for place, chance in enumerate(chances("Hallway-v0", state, action)):
-        if chance > 0:
-            key = divmod(int(world.hidden[place]), 4)
-            found[key] = found.get(key, 0) + chance
-    return {key: pytest.approx(value) for key, value in found.items()}
 
 
 TURNS = {RIGHT: (0.1, 0.7, 0.1, 0.1), AROUND: (0.1, 0.15, 0.6, 0.15), LEFT: (0.1, 0.1, 0.1, 0.7)}
@@ -385,34 +334,32 @@ MOVES = [  # rows of the file hallway.POMDP, with its states written as cell and
 
 @pytest.mark.parametrize(("cell", "action", "facing", "expected"), MOVES)
 def test_moves_in_the_hallway_are_those_of_the_original(cell, action, facing, expected):
-    assert places(cell, action, facing) == expected
+    """By cell and facing, the chances after an action; cells 0 to 10 are the row, then alcoves."""
+    hidden = _hallway().hidden
+    state = np.flatnonzero(hidden == 4 * cell + facing)[0]
+    found = np.bincount(hidden, chances(model_of("Hallway-v0"), state, action))
+    places = np.flatnonzero(found)
+    assert {divmod(place, 4): found[place] for place in places} == pytest.approx(expected)
 
 
 def test_readings_are_those_of_the_original():
-    from rl_yardstick.envs.pomdp import _hallway
-
-    env, world = gym.make("Hallway-v0"), _hallway()
-    model = known.transition_model(env)
-
-    def readings(cell, facing):
-        """The chances of readings at the start, given where that is, as they are after staying."""
-        there = np.flatnonzero(world.hidden == 4 * cell + facing)
-        first, stayed = np.zeros(21), chances("Hallway-v0", there[0], STAY)
-        np.add.at(first, world.reading[there], model.initial[there])
-        later = np.bincount(world.reading[there], stayed[there], 21)
-        np.testing.assert_allclose(later, first * 56)
-        return later
-
+    env, model = gym.make("Hallway-v0"), model_of("Hallway-v0")
+    # The chances of readings at the start, given where that is, are those after staying there.
+    places = _hallway().hidden, _hallway().reading
+    first, stayed = np.zeros((2, 60, 21))
+    np.add.at(first, places, model.initial)
+    for place in range(56):
+        there = np.flatnonzero(places[0] == place)[0]
+        np.add.at(stayed, places, chances(model, there, STAY))
+    np.testing.assert_allclose(stayed, 56 * first, atol=1e-12)
+    readings = stayed.reshape(15, 4, 21)
     # Rows of O in the file, rounded there: walls to the north, south and west of the west end.
-    first = readings(0, NORTH)
-    assert first[[11, 15, 3, 9, 1, 0]] == pytest.approx(
-        [0.692550, 0.036464, 0.076949, 0.076949, 0.008549, 0.000949], abs=3e-5
-    )
-    assert readings(1, EAST)[5] == pytest.approx(0.731024, abs=3e-5)
-    assert readings(2, NORTH)[8] == pytest.approx(0.771637, abs=3e-5)
+    told = [0.692550, 0.036464, 0.076949, 0.076949, 0.008549, 0.000949]
+    assert readings[0, NORTH, [11, 15, 3, 9, 1, 0]] == pytest.approx(told, abs=3e-5)
+    assert readings[1, EAST, 5] == pytest.approx(0.731024, abs=3e-5)
+    assert readings[2, NORTH, 8] == pytest.approx(0.771637, abs=3e-5)
     for cell, sign in ((2, 16), (4, 17), (6, 18), (8, 19)):
-        assert readings(cell, SOUTH)[sign] == pytest.approx(1)
-    assert model.initial.sum() == pytest.approx(1)
+        assert readings[cell, SOUTH, sign] == pytest.approx(1)
     assert env.observation_space.n == 21
     # The goal's alcove ends the episode with the only reward.
     ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]

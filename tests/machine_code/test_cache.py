@@ -46,8 +46,7 @@ def checkout(tmp_path_factory):
     """A copy of the packages that train, with nothing compiled."""
     root = tmp_path_factory.mktemp("checkout")
     for package in ("safe_files", "machine_code", "mdp", "agents", "envs"):
-        ignored = shutil.ignore_patterns("__pycache__")
-        copy = root / "rl_yardstick" / package
+        copy, ignored = root / "rl_yardstick" / package, shutil.ignore_patterns("__pycache__")
         shutil.copytree(code_cache.ROOT / package, copy, ignore=ignored)
     shutil.copy(code_cache.ROOT / "__init__.py", root / "rl_yardstick")
     (root / "rl_yardstick" / "mdp" / "small_loop.py").write_text(LOOP)
@@ -112,14 +111,11 @@ def test_a_rule_of_the_users_own_follows_its_source(checkout):
 
 def test_old_machine_code_goes_away(tmp_path):
     for age in range(code_cache.KEPT_BESIDE + 3):
-        (tmp_path / f"old{age}").mkdir()
-        os.utime(tmp_path / f"old{age}", (1000 - age, 1000 - age))
-    used = tmp_path / "used"
-    used.mkdir()
-    os.utime(used, (0, 0))
-    code_cache.remove_old(used)
-    kept = {f"old{age}" for age in range(code_cache.KEPT_BESIDE)}
-    assert {path.name for path in tmp_path.iterdir()} == {"used", *kept}
+        (tmp_path / str(age)).mkdir()
+        os.utime(tmp_path / str(age), (1000 - age, 1000 - age))
+    oldest, *kept = str(age), *map(str, range(code_cache.KEPT_BESIDE))
+    code_cache.remove_old(tmp_path / oldest)  # the one in use
+    assert {path.name for path in tmp_path.iterdir()} == {oldest, *kept}
 
 
 @pytest.mark.parametrize("has_home", [True, False])
@@ -135,12 +131,9 @@ def test_where_the_package_cannot_be_written_the_home_serves_or_nothing(
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(home))
     found = code_cache.folder.__wrapped__()
-    if has_home:
-        assert found.parent == home / "yardstick" / "machine_code"
-        assert found.is_dir()
-    else:
-        assert found is None
-        assert "each process compiles anew" in caplog.text
+    place = home / "yardstick" / "machine_code"
+    assert (list(place.iterdir()) == [found]) if has_home else (found is None)
+    assert ("each process compiles anew" in caplog.text) != has_home
 
 
 @called
@@ -164,27 +157,15 @@ def scaled_total(numbers, times):
     return total(numbers, 1) + total(numbers, times)
 
 
-class Compiled(event.Listener):
-    """Names of what is compiled."""
-
-    names = ()
-
-    def on_start(self, event):
-        self.names += (event.data["dispatcher"].py_func.__name__,)
-
-    def on_end(self, event):
-        pass
-
-
 def test_parts_are_compiled_once_and_only_python_is_refused():
     numbers = np.array([1.0, 2.5])
     with pytest.raises(TypeError, match="only compiled functions can call scale"):
         scale(numbers, 2)
-    noted = Compiled()
-    with event.install_listener("numba:compile", noted):
+    with event.install_recorder("numba:compile") as noted:
         assert scaled_total(numbers, 3) == 4 * 6 * 3.5
+    begun = [one.data["dispatcher"].py_func.__name__ for _, one in noted.buffer if one.is_start]
     # Numbers that are written out are none of their own type.
-    assert sorted(noted.names) == ["scale", "scaled_total", "total"]
+    assert sorted(begun) == ["scale", "scaled_total", "total"]
     assert numbers.tolist() == [6.0, 15.0]
     with pytest.raises(TypeError, match="only compiled functions can call scale"):
         scale(numbers, 2)

@@ -29,24 +29,17 @@ def coin(end, reward=1.0):
     )
 
 
-def test_the_geometric_distribution_to_its_end_cut_off_and_without_end():
+def test_the_geometric_distribution_to_its_end_and_without_end():
     found = mdp.policy_return(coin(0.2, reward=3), np.array([0]), None)
     lengths, returns = (5, 0.8 / 0.04), (15, 9 * 0.8 / 0.04)
     assert (found.expected_length, found.length_variance) == pytest.approx(lengths)
     assert (found.expected_return, found.return_variance) == pytest.approx(returns)
     assert found.success_rate is None
-    model = coin(0.5)
-    found = mdp.policy_return(model, np.array([0]), 3, success=model.terminated)
-    assert (found.expected_length, found.success_rate) == (0.5 * 1 + 0.25 * 2 + 0.25 * 3, 0.875)
-    assert mdp.state_visitation(model, np.array([0]), 3).tolist() == [1.75]
-    success = np.ones((1, 2, 2), bool)
-    found = mdp.policy_return(model, np.array([1]), None, 0.9, success)
+    found = mdp.policy_return(coin(0.5), np.array([1]), None, 0.9, np.ones((1, 2, 2), bool))
     assert found.expected_return == pytest.approx(10)
     assert found.return_variance == pytest.approx(0)
     assert (found.expected_length, found.success_rate) == (np.inf, 0)
     assert np.isnan(found.length_variance)
-    # Marks of success that do not end the episode are ignored.
-    assert mdp.policy_return(model, np.array([1]), 9, success=success).success_rate == 0
 
 
 @pytest.mark.parametrize("horizon", [None, 400])

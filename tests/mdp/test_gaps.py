@@ -118,75 +118,38 @@ def test_the_gradient_of_a_policy_is_that_of_its_return(drawn):
     assert (nearby - value) / step == pytest.approx((slope * toward).sum(), abs=1e-3 * scale)
 
 
-def chain():
-    """Two states: 0 goes on (rewards 1 and 2, then the end), 1 stays for nothing."""
-    return deterministic([[1, 0], [1, 1]], [[1, 0], [2, 0]], [[False, False], [True, False]])
-
-
-EVEN = np.full((2, 2), 0.5)
-
-
-def test_values_of_a_chain_worked_out_by_hand():
-    # V(1) = 1/2 2 + 1/2 1/2 V(1), and V(0) = 1/2 (1 + 1/2 V(1)) + 1/2 1/2 V(0).
-    found = discounted_values(chain(), EVEN, 0.5)
-    assert found.values == pytest.approx([10 / 9, 4 / 3])
-    assert found.action_values == pytest.approx(np.array([[5 / 3, 5 / 9], [2, 2 / 3]]))
-    assert found.advantages == pytest.approx(np.array([[5 / 9, -5 / 9], [2 / 3, -2 / 3]]))
-
-
 def test_without_discount_what_may_never_end_has_no_value():
+    # Action 0 goes on (rewards 1 and 2, then the end), 1 stays for nothing.
+    chain = deterministic([[1, 0], [1, 1]], [[1, 0], [2, 0]], [[False, False], [True, False]])
     # In state 1 it stays for ever; without it, state 0 would have one.
-    found = discounted_values(chain(), np.array([[0.5, 0.5], [0.0, 1.0]]), 1.0)
+    found = discounted_values(chain, np.array([[0.5, 0.5], [0.0, 1.0]]), 1.0)
     assert np.isnan(found.values).all()
     assert found.action_values[1, 0] == 2.0
     assert np.isnan(found.action_values[[0, 0, 1], [0, 1, 1]]).all()
-    ends = discounted_values(chain(), np.array([[1.0, 0.0], [0.5, 0.5]]), 1.0)
+    ends = discounted_values(chain, np.array([[1.0, 0.0], [0.5, 0.5]]), 1.0)
     assert ends.values == pytest.approx([3.0, 2.0])
 
 
-@st.composite
-def drawn_cases(draw):
-    model = draw(models())
-    policy = draw(distributions((model.n_states, model.n_actions)))
-    numbers = st.floats(-3, 3, width=16)
-    critic = np.array(draw(st.lists(numbers, min_size=model.n_states, max_size=model.n_states)))
-    return model, policy, critic, draw(st.sampled_from([0.0, 0.5, 0.9]))
-
-
-def by_enumeration(model, policy, critic, discount, trace, state, action, n_left):
-    """The mean of the sum of TD errors, over all that may happen in so many steps."""
+def mean_estimates(model, policy, critic, discount, trace, n_left):
+    """The mean of the sum of so many TD errors, for each state and action."""
     if n_left == 0:
-        return 0.0
-    total = 0.0
-    for k in range(model.n_outcomes):
-        chance, after = model.prob[state, action, k], model.next_state[state, action, k]
-        if chance == 0:
-            continue
-        goes_on = not model.terminated[state, action, k]
-        error = model.reward[state, action, k] - critic[state]
-        if goes_on:
-            error += discount * critic[after]
-            for then in range(model.n_actions):
-                later = by_enumeration(
-                    model, policy, critic, discount, trace, after, then, n_left - 1
-                )
-                error += discount * trace * policy[after, then] * later
-        total += chance * error
-    return total
+        return np.zeros_like(policy)
+    later = (policy * mean_estimates(model, policy, critic, discount, trace, n_left - 1)).sum(1)
+    after = np.where(model.terminated, 0.0, (critic + trace * later)[model.next_state])
+    errors = model.reward + discount * after - critic[:, None, None]
+    return (model.prob * errors).sum(axis=2)
 
 
 @settings(max_examples=25)
-@given(drawn_cases(), st.sampled_from([0.0, 0.6, 1.0]))
-def test_what_estimates_expect_is_the_mean_over_all_that_may_happen(case, trace):
-    model, policy, critic, discount = case
+@given(models(), st.sampled_from([0, 0.5, 0.9]), st.sampled_from([0, 0.6, 1]), st.data())
+def test_what_estimates_expect_is_the_mean_over_all_that_may_happen(model, discount, trace, data):
+    policy = data.draw(distributions((model.n_states, model.n_actions)))
+    critic = data.draw(hnp.arrays(np.float64, model.n_states, elements=st.integers(-9, 9))) / 3
     reachable = np.flatnonzero(model.reachable)
     steps = [(s, a, n) for s in reachable for a in range(model.n_actions) for n in (3, 1, 2)]
     columns = tuple(np.array(steps).T)
     given_action, given_state = expected_estimates(model, policy, critic, discount, trace, columns)
     for i, (state, action, n) in enumerate(steps):
-        told = [
-            by_enumeration(model, policy, critic, discount, trace, state, a, n)
-            for a in range(model.n_actions)
-        ]
+        told = mean_estimates(model, policy, critic, discount, trace, n)[state]
         assert given_action[i] == pytest.approx(told[action], abs=1e-9)
         assert given_state[i] == pytest.approx(policy[state] @ told, abs=1e-9)

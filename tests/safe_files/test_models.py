@@ -5,6 +5,7 @@ same weights, to the last bit.
 """
 
 import random
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -33,15 +34,6 @@ from rl_yardstick.safe_files.models import inspect_model, load_model
 FOLDER = Path(__file__).parent / "old_models"
 
 
-def masked():
-    return ActionMasks(gym.make("Warehouse-v0"))
-
-
-def bits():
-    return BitFlippingEnv(n_bits=3, max_steps=3)
-
-
-TINY = {"net_arch": [4]}
 FEW = {"learning_starts": 10, "buffer_size": 200, "batch_size": 8}
 ROLLOUT = {"n_steps": 32, "batch_size": 16}
 NOISE = np.zeros(1), np.full(1, 0.1)
@@ -62,6 +54,7 @@ HINDSIGHT = {
     "replay_buffer_class": sb3.HerReplayBuffer,
     "replay_buffer_kwargs": {"n_sampled_goal": 2, "goal_selection_strategy": "future"},
 }
+LSTM = {"policy_kwargs": {"lstm_hidden_size": 4, "net_arch": [4]}}
 SDE = {"use_sde": True}
 
 
@@ -71,12 +64,13 @@ def case(algorithm, env_id, *kwargs, policy="MlpPolicy", n_envs=1, around=None):
     return algorithm, policy, env_id, n_envs, around, together
 
 
+BITS = partial(BitFlippingEnv, n_bits=3, max_steps=3)
 ORNSTEIN, NORMAL = OrnsteinUhlenbeckActionNoise(*NOISE), NormalActionNoise(*NOISE)
 CART, SWING = "CartPole-v1", "Pendulum-v1"
 CASES = {
     "ppo with schedules, normalised": case(sb3.PPO, CART, ROLLOUT, SCHEDULES, around="normalize"),
     "a2c on stacked frames": case(sb3.A2C, CART, STACKED, around="stack"),
-    "dqn with hindsight": case(sb3.DQN, bits, FEW, HINDSIGHT, policy="MultiInputPolicy"),
+    "dqn with hindsight": case(sb3.DQN, BITS, FEW, HINDSIGHT, policy="MultiInputPolicy"),
     "sac with sde and noise": case(sb3.SAC, SWING, FEW, SDE, {"action_noise": ORNSTEIN}),
     "td3 with noise": case(sb3.TD3, SWING, FEW, {"action_noise": NORMAL}, n_envs=2),
     "qrdqn": case(contrib.QRDQN, CART, FEW),
@@ -84,8 +78,8 @@ CASES = {
     "trpo": case(contrib.TRPO, CART, ROLLOUT),
     "crossq": case(contrib.CrossQ, SWING, FEW),
     "ars": case(contrib.ARS, SWING, {"n_delta": 1}, policy="LinearPolicy"),
-    "ppo_mask": case(contrib.MaskablePPO, masked, ROLLOUT),
-    "ppo_lstm": case(contrib.RecurrentPPO, CART, ROLLOUT, policy="MlpLstmPolicy"),
+    "ppo_mask": case(contrib.MaskablePPO, lambda: ActionMasks(gym.make("Warehouse-v0")), ROLLOUT),
+    "ppo_lstm": case(contrib.RecurrentPPO, CART, ROLLOUT, LSTM, policy="MlpLstmPolicy"),
 }
 
 
@@ -99,11 +93,7 @@ def make_env(name):
 
 def make_model(name):
     algorithm, policy, *_, kwargs = CASES[name]
-    # A copy: the library adds to it.
-    policy_kwargs = dict(TINY) if policy == "MlpPolicy" else {}
-    if algorithm is contrib.RecurrentPPO:
-        policy_kwargs = {"lstm_hidden_size": 4, "net_arch": [4]}
-    kwargs = {"policy_kwargs": policy_kwargs, **kwargs}
+    kwargs = {"policy_kwargs": {} if policy == "LinearPolicy" else {"net_arch": [4]}, **kwargs}
     return algorithm(policy, make_env(name), device="cpu", **kwargs)
 
 

@@ -28,35 +28,14 @@ STUDIES = [
 GUIDE = (ROOT / "docs" / "course.md").read_text()
 
 
-def study(name):
-    return read_study(ROOT / "studies" / f"{name}.yml")
-
-
-def shrunk(whole, agents=None, environments=None, **changes):
+def shrunk(name, agents, environments="", **changes):
     """A part of a study, by the beginnings of labels."""
-
-    def chosen(entries, beginnings):
-        return tuple(e for e in entries if beginnings is None or e.label.startswith(beginnings))
-
-    return replace(
-        whole,
-        agents=chosen(whole.agents, agents),
-        environments=chosen(whole.environments, environments),
-        **changes,
-    )
-
-
-def training_returns(results, agent):
-    """Returns of the training episodes, shape (n_seeds, n_episodes)."""
-    runs = [one.path for one in results.planned if one.agent == agent]
-    assert len(runs) == results.study.n_seeds
-    return np.array([read_episodes(one).returns for one in runs])
-
-
-def assert_mean(values, expected, spread, n_expected):
-    """Four standard errors; ``spread`` is the standard deviation over seeds."""
-    error = spread * math.sqrt(1 / n_expected + 1 / len(values))
-    assert np.mean(values) == pytest.approx(expected, abs=4 * error)
+    whole = read_study(ROOT / "studies" / f"{name}.yml")
+    kept = {
+        kind: tuple(each for each in getattr(whole, kind) if each.label.startswith(labels))
+        for kind, labels in (("agents", agents), ("environments", environments))
+    }
+    return replace(whole, **kept, **changes)
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
@@ -70,13 +49,9 @@ def test_a_study_reads_plans_and_fits(path, tmp_path):
     assert len({one.path for one in planned}) == len(planned)
     for one in planned:
         if one.seed == 0:
-            algorithm = load_algorithm(one.spec.algo)
-            assert (
-                constructor_arguments(one.spec, algorithm, False).keys()
-                >= one.spec.algorithm.keys()
-            )
-    short = plan(whole.quickened(), tmp_path)
-    assert len(short) < len(planned)
+            arguments = constructor_arguments(one.spec, load_algorithm(one.spec.algo), False)
+            assert arguments.keys() >= one.spec.algorithm.keys()
+    assert len(plan(whole.quickened(), tmp_path)) < len(planned)
 
 
 def test_the_guide_gives_the_command_of_each_study():
@@ -85,50 +60,40 @@ def test_the_guide_gives_the_command_of_each_study():
     assert set(re.findall(r"studies/([\w-]+\.yml)", GUIDE)) == named
 
 
-# Mean and standard deviation over 100 seeds of the mean return of 500 episodes, by the last one.
-SLIDES = {
-    "Q-learning": {500: (20.9, 3.0), 1500: (39.5, 19), 2500: (117, 47), 4500: (300, 86)},
-    "SARSA": {500: (20.5, 2.6), 1500: (27.5, 11), 2500: (64, 34), 4500: (222, 67)},
-}
+# A study, agent and environment, seeds here and there; the optimum, and whether it is reached; the
+# mean return of episodes from one to another, and its standard deviation over seeds.
+SLIDES, LAKE = "cartpole-qlearning-vs-sarsa", "frozenlake8x8-qlearning"
+RETURNS = [
+    (SLIDES, "Q-learning as printed", "", 4, 100, None, None,
+     [(0, 500, 20.9, 3.0), (1000, 1500, 39.5, 19), (2000, 2500, 117, 47), (4000, 4500, 300, 86)]),
+    (SLIDES, "SARSA as printed", "", 4, 100, None, None,
+     [(0, 500, 20.5, 2.6), (1000, 1500, 27.5, 11), (2000, 2500, 64, 34), (4000, 4500, 222, 67)]),
+    ("warehouse-qlearning", "as printed", "shelf -100", 10, 30, 79.0, True,
+     [(0, 1, -7885, 1408), (0, 100, -431, 22), (200, 300, -9, 9), (-100, None, -7, 11)]),
+    (LAKE, "as printed", "at most 99", 20, 200, 0.6353, False,
+     [(0, None, 0.106, 0.070), (-1000, None, 0.203, 0.120)]),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SLIDES)
-def test_the_table_of_the_slides(do_study, tmp_path, name):
-    agent = f"{name} as printed"
-    part = shrunk(study("cartpole-qlearning-vs-sarsa"), (agent,), n_seeds=4, eval_freq=-1)
-    returns = training_returns(do_study(part, tmp_path), agent)
-    assert returns.shape == (4, 5000)
-    for end, (expected, spread) in SLIDES[name].items():
-        assert_mean(returns[:, end - 500 : end].mean(axis=1), expected, spread, 100)
-
-
-def test_the_warehouse_with_the_rewards_of_the_text(do_study, tmp_path):
-    part = shrunk(study("warehouse-qlearning"), "as printed", "shelf -100", n_seeds=10)
-    results = do_study(part, tmp_path)
-    returns = training_returns(results, "as printed")
-    # Over 30 seeds; the figures after +- are standard deviations of a seed's mean.
-    for part_of, expected, spread in (
-        (returns[:, :1], -7885, 1408),
-        (returns[:, :100], -431, 22),
-        (returns[:, 200:300], -9, 9),
-        (returns[:, -100:], -7, 11),
-    ):
-        assert_mean(part_of.mean(axis=1), expected, spread, 30)
-    assert set(results.summary["final"]) == {79.0}
-
-
-def test_the_8x8_lake_with_decaying_noise(do_study, tmp_path):
-    part = shrunk(study("frozenlake8x8-qlearning"), "as printed", "at most 99", n_seeds=20)
-    results = do_study(part, tmp_path)
-    returns = training_returns(results, "as printed")
-    assert_mean(returns.mean(axis=1), 0.106, 0.070, 200)
-    assert_mean(returns[:, -1000:].mean(axis=1), 0.203, 0.120, 200)
-    assert results.summary["optimum"].iloc[0] == pytest.approx(0.6353, abs=5e-5)
-    assert (results.summary["final"] < 0.6353).all()
+@pytest.mark.parametrize("case", RETURNS, ids=lambda case: " ".join(case[:2]))
+def test_training_returns_what_the_course_says(do_study, tmp_path, case):
+    name, agent, world, n_seeds, n_expected, optimum, is_reached, parts = case
+    evaluated = {} if optimum else {"eval_freq": -1}
+    results = do_study(shrunk(name, agent, world, n_seeds=n_seeds, **evaluated), tmp_path)
+    returns = np.array([read_episodes(one.path).returns for one in results.planned])
+    assert len(returns) == n_seeds
+    for first, last, expected, spread in parts:
+        error = spread * math.sqrt(1 / n_expected + 1 / n_seeds)
+        found = returns[:, first:last].mean(axis=1)
+        assert np.mean(found) == pytest.approx(expected, abs=4 * error)
+    if optimum:
+        assert results.summary["optimum"].to_numpy() == pytest.approx(optimum, abs=5e-5)
+        assert (results.summary["final"] == results.summary["optimum"]).all() == is_reached
+        assert is_reached or (results.summary["final"] < optimum).all()
 
 
 def test_values_of_the_small_grid(do_study, tmp_path):
-    part = shrunk(study("small-grid"), ("qlearning", "sarsa"), n_seeds=3)
+    part = shrunk("small-grid", ("qlearning", "sarsa"), n_seeds=3)
     results = do_study(part, tmp_path)
     corner = {agent.label: [] for agent in part.agents}
     for one in results.planned:

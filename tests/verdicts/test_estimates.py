@@ -82,12 +82,9 @@ def test_a_share_has_the_interval_of_clopper_and_pearson():
     ],
 )
 def test_steps_to_a_threshold(values, threshold, first, to_stay):
-    steps = [10, 20, 30, 40]
-    assert verdicts.steps_to_threshold(steps, values, threshold) == pytest.approx(
-        first, nan_ok=True
-    )
-    found = verdicts.steps_to_threshold(steps, values, threshold, to_stay=True)
-    assert found == pytest.approx(to_stay, nan_ok=True)
+    for stays, expected in ((False, first), (True, to_stay)):
+        found = verdicts.steps_to_threshold([10, 20, 30, 40], values, threshold, to_stay=stays)
+        assert found == pytest.approx(expected, nan_ok=True)
 
 
 def test_curves_that_are_none_are_refused():
@@ -111,9 +108,8 @@ def test_the_shared_grid_is_where_all_curves_are():
 
 def test_a_curve_on_a_grid_holds_its_latest_value():
     grid = [0, 10, 14.9, 20, 99]
-    assert verdicts.on_grid([10, 20], [1, 2], grid).tolist() == pytest.approx(
-        [NAN, 1, 1, 2, 2], nan_ok=True
-    )
+    found = verdicts.on_grid([10, 20], [1, 2], grid).tolist()
+    assert found == pytest.approx([NAN, 1, 1, 2, 2], nan_ok=True)
     # Two evaluations at one step: the later one.
     assert verdicts.on_grid([10, 10, 20], [1, 5, 2], [10]).tolist() == [5]
     assert verdicts.on_grid([10, 20], [[1, 2], [3, 4]], [15, 25]).tolist() == [[1, 2], [3, 4]]
