@@ -6,7 +6,6 @@ import pytest
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.commands import compare, enjoy, train, tune
-from rl_yardstick.commands.cli import _INSTEAD
 from rl_yardstick.commands.compare import study_spec
 from rl_yardstick.commands.train import spec_from_flags
 from rl_yardstick.commands.tune import tuning_spec
@@ -136,42 +135,6 @@ def test_an_engine_is_a_setting_where_there_is_a_choice(tmp_path):
     for words, expected in (((), {"auto", None}), (("--engine", "compiled"), {"compiled"})):
         agents = compared(headline, *words).agents
         assert {agent.settings.get("engine") for agent in agents} == expected
-
-
-def test_what_is_refused_by_every_command():
-    complaint = "--engine auto and -params engine:compiled disagree: give one of them"
-    words = ["-n", "10", "-params", "engine:compiled", "--engine", "auto"]
-    # Another agent of the study may have what this one has not.
-    for ask in (
-        lambda: trained("--algo", "ppo", *words),
-        lambda: compared(*LAKE, "--algos", "sarsa", "ppo", *words),
-        lambda: tuned("--algo", "ppo", *words),
-    ):
-        with pytest.raises(UserError, match=f"^{re.escape(complaint)}$"):
-            ask()
-
-
-def answer(module, words):
-    with pytest.raises(UserError) as mistake:
-        module.build_parser().parse_args(words.split(" "))
-    return str(mistake.value)
-
-
-MEANT = [
-    (TRAIN, "--lr 0.1", "behind -params: -params learning_rate:0.1 "),
-    (TRAIN, "--epsilon 0.1 --algo dqn", "-params exploration_final_eps:0.1 "),
-    (TRAIN, "-yaml x.yml", "did you mean '--conf-file'?"),
-    (ENJOY, "--gamma 0.9", "hyperparameters can only be set in train: -params gamma:0.9 "),
-    (COMPARE, "--seed 3", "did you mean '--seeds'?"),
-    (COMPARE, "--see 3", "unknown argument --see"),  # no abbreviation is taken
-]
-
-
-def test_what_was_meant():
-    for module, words, meant in MEANT:
-        assert meant in answer(module, words)
-    for flag, said in _INSTEAD.items():  # what rl_zoo3 has
-        assert f"unknown argument {flag} 1: {said}" in answer(TRAIN, f"{flag} 1")
 
 
 # What may be typed beside --resume: nothing that the run has already, not even as it has it.
