@@ -104,7 +104,7 @@ def drawn(monkeypatch):
 
     def draw(canvas, file, **_):
         canvas.figure.set_dpi(100)
-        canvas.draw()
+        canvas.figure.get_layout_engine().execute(canvas.figure)
         found.append(canvas.figure)
         file.touch()
 
