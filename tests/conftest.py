@@ -79,12 +79,10 @@ def signals_are_left_as_they_were():
     assert after == before
 
 
-HOSTILE = "</script><script>document.title='taken'</script>"
-
-
 def small_study():
     """Three agents, one of them with a name that is an attack, on two maps with two seeds."""
     from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+    from tests.report.made_up import HOSTILE
 
     agents = (
         AgentSpec("Q-learning & co", "qlearning"),

@@ -20,12 +20,7 @@ sys.path += [str(ROOT / "benchmarks"), str(ROOT / "docs" / "scripts")]
 
 from documented_commands import SEEDS, n_solved, outcome, prepared_folder  # noqa: E402
 
-from recommended_commands import (  # noqa: E402
-    PAGE,
-    reached,
-    trainings,
-    with_outcomes,
-)
+from recommended_commands import PAGE, reached, trainings, with_outcomes  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 COMPARE = (ROOT / "docs" / "compare.md").read_text()
@@ -37,53 +32,43 @@ COMMAND = re.compile(
 FOUND_IN = {
     command.strip(): document.name
     for document in reversed([ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))])
-    for command in COMMAND.findall(
-        document.read_text().replace("--env\nWarehouse", "--env Warehouse")
-    )
+    for command in COMMAND.findall(document.read_text().replace("--env\nWare", "--env Ware"))
 }
-PARSED_ALONE = {
-    "explain": explain.build_parser,
-    "shaping": shaping.build_parser,
-    "audit": audit.build_parser,
-}
+MODULES = {"train.py": train, "enjoy.py": enjoy, "compare.py": compare, "tune.py": tune}
+MODULES |= {"explain": explain, "shaping": shaping, "audit": audit}
 COMMANDS = [pytest.param(each, id=f"{name}: {each}") for each, name in FOUND_IN.items()]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_can_be_carried_out(tmp_path, monkeypatch, command):
     script, *words = shlex.split(command.removeprefix("-m rl_yardstick "))
+    # What the commands take for granted.
+    (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
+    log = "segment,arm,reward,propensity\ncore,0,1,0.5\ncasual,1,0,0.5\n"
+    (tmp_path / "train.csv").write_text(log)
+    monkeypatch.chdir(ROOT if script == "compare.py" else tmp_path)
+    args = MODULES[script].build_parser().parse_args(words)
     if script == "train.py":
-        # What the commands take for granted.
-        (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
-        log = "segment,arm,reward,propensity\ncore,0,1,0.5\ncasual,1,0,0.5\n"
-        (tmp_path / "train.csv").write_text(log)
-        monkeypatch.chdir(tmp_path)
-        args = train.build_parser().parse_args(words)
         args.trained_agent = ""
         assert args.list or spec_from_flags(args).env_id == args.env
     elif script == "enjoy.py":
-        args = enjoy.build_parser().parse_args(words)
         assert args.model is not None or args.env == "Warehouse-v0"
     elif script == "tune.py":
-        args = tune.build_parser().parse_args(words)
         assert tuning_spec(args).environment.env_id == args.env
-    elif script in PARSED_ALONE:  # the runs and modules that they name are examples
-        assert vars(PARSED_ALONE[script]().parse_args(words))
-    else:
-        monkeypatch.chdir(ROOT)
-        args = compare.build_parser().parse_args(words)
+    elif script == "compare.py":
         assert bool(args.logged) == bool(args.policy)
-        study = None if args.logged else study_spec(args)
-        if study is not None and "map.txt" not in command:
-            assert sum(run.n_runs for run in plan(study, tmp_path)) >= study.n_seeds
+        if not args.logged:
+            study = study_spec(args)
+            if "map.txt" not in command:
+                assert sum(run.n_runs for run in plan(study, tmp_path)) >= study.n_seeds
 
 
 def test_there_are_commands_to_check():
     counts = Counter(command.removeprefix("-m rl_yardstick ").split()[0] for command in FOUND_IN)
     assert counts["compare.py"] >= 20
     assert counts["train.py"] >= 6
-    assert min(counts[script] for script in ("enjoy.py", "tune.py")) >= 2
-    assert all(counts[command] for command in PARSED_ALONE)
+    assert min(counts["enjoy.py"], counts["tune.py"]) >= 2
+    assert all(counts[script] for script in MODULES)
     assert len(SAMPLE) > 10
 
 
@@ -95,9 +80,8 @@ def test_the_readmes_script_prints_what_stands_below_it(capsys):
 
 def test_what_the_readme_and_the_page_on_compare_point_to_is_there():
     for text, folder in ((README, ROOT), (COMPARE, ROOT / "docs")):
-        targets = re.findall(r"\]\(([^)#\s]+)(?: \"[^\"]*\")?\)", text) + re.findall(
-            r'src="([^"]+)"', text
-        )
+        targets = re.findall(r"\]\(([^)#\s]+)(?: \"[^\"]*\")?\)", text)
+        targets += re.findall(r'src="([^"]+)"', text)
         files = [target for target in targets if not target.startswith("http")]
         assert len(files) >= 4
         assert [name for name in files if not (folder / name).exists()] == []
@@ -129,7 +113,7 @@ ROWS = reached()
 SURE = [
     one
     for one in trainings()
-    if one in ROWS and ROWS[one].seconds <= SECONDS and ROWS[one].n_solved == ROWS[one].n_runs
+    if (row := ROWS.get(one)) and row.seconds <= SECONDS and row.n_solved == row.n_runs
 ]
 SAMPLE = list({re.search(r"--algo (\S+)", one)[1]: one for one in reversed(SURE)}.values())
 

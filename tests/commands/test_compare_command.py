@@ -107,28 +107,15 @@ def test_films_and_pages_of_training(typed, own_folder, monkeypatch):
     for path in films:
         with Image.open(path) as film:
             assert film.n_frames > 1
-    code, out, err = typed("compare.py", *words, "--no-report")
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "leave out --no-report" in err
 
 
-def is_alive(pid):
-    """Whether the process runs, and is not only remembered for its parent."""
-    with contextlib.suppress(OSError):
-        status = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2]
-        return status.split()[0] != "Z"
-    return False
-
-
-def session_of(leader):
-    """The processes that a command has started, itself included."""
-    found = set()
+def living(leader):
+    """The processes of a command, but for those that are only remembered for their parents."""
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
-            fields = path.read_text().rpartition(")")[2].split()
-            if int(fields[3]) == leader:
-                found.add(int(path.parent.name))
-    return found
+            state, _, _, session = path.read_text().rpartition(")")[2].split()[:4]
+            if int(session) == leader and state != "Z":
+                yield path.parent.name
 
 
 WALKS = Path(__file__).parents[1] / "experiments" / "walks.py"
@@ -139,7 +126,7 @@ SLOW += ["--no-report", "-n", "2000", "--seeds", "2", "-j", "2", "-f", "studies"
 
 @pytest.fixture
 def begun(own_folder):
-    """A study in the middle of its runs: the command, its folder, all of its processes."""
+    """A study in the middle of its runs: the command, and its folder."""
     shutil.copy(WALKS, own_folder)
     process = subprocess.Popen(
         [sys.executable, str(COMPARE), *SLOW],
@@ -150,7 +137,7 @@ def begun(own_folder):
     )
     study = own_folder / "studies" / "Walk-v0_qlearning"
     wait_for(lambda: len(list(study.glob("runs/*/*/state.bin"))) == 2)
-    yield process, study, session_of(process.pid)
+    yield process, study
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
 
@@ -161,14 +148,14 @@ def states(study):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_the_same_command_does_what_is_left(number, typed, own_folder, begun):
-    process, study, started = begun
+    process, study = begun
     # A second command says that the folder is in use, and touches nothing.
     code, _, err = typed("compare.py", *SLOW, "-params", "gamma:0.5")
     assert (code, err.count("\n"), "in use by another command" in err) == (2, 1, True)
     # A terminal sends a signal to all processes.
     (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
     out, err = process.communicate(timeout=120)
-    wait_for(lambda: not any(map(is_alive, started)))
+    wait_for(lambda: not [*living(process.pid)])
     if number == signal.SIGKILL:
         assert process.returncode == -number
     else:
@@ -216,7 +203,6 @@ def test_it_grows_until_decided_and_remembers_its_looks(typed, own_folder):
 
 
 def test_agents_of_the_library_and_blind_ones_are_judged(type_command, tmp_path, monkeypatch):
-    """The table and the verdicts of another agent are recorded in ``tests/golden``."""
     monkeypatch.setenv("COLUMNS", "120")  # room for the paths of runs
     log = {"env_kwargs": {"log": "log.csv"}}
     small = {"n_steps": 64, "batch_size": 64}
@@ -229,10 +215,6 @@ def test_agents_of_the_library_and_blind_ones_are_judged(type_command, tmp_path,
     assert (code, err) == (0, "")
     for run in (blind, ppo):
         assert f"{run} was trained on this log: its figures flatter it" in out
-    shutil.copy(tmp_path / ppo / "ReplayBandit-v0.zip", "alone.zip")
-    code, _, err = type_command("compare.py", "--logged", "log.csv", "--policy", "alone.zip")
-    assert code == 2
-    assert "is in no run folder" in err
 
 
 def test_the_python_of_the_page_runs(tmp_path, monkeypatch, capsys):

@@ -23,8 +23,6 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lake")
     run, _ = trained("random", folder=folder / "logs", n_timesteps=100, save_freq=40)
     shutil.copy(run.path / "rl_model_40_steps.zip", run.path / "best_model.zip")
-    content = (run.path / f"{LAKE}.zip").read_bytes()
-    (folder / "truncated.zip").write_bytes(content[:-200])
     return folder
 
 
@@ -61,13 +59,6 @@ CHOICES = {
     RUN: f"{LAKE}.zip",
     f"{RUN}/rl_model_40_steps.zip": "rl_model_40_steps.zip",
 }
-REFUSED = {
-    "--n-envs 2 --render ansi": "--render ansi shows one environment",
-    "--record film.avi": "--record writes .gif files",
-    "--record nowhere/film.gif": "there is no folder nowhere",
-    "--norm-reward": "no statistics of VecNormalize belong to this model",
-    "truncated.zip": "no whole zip of an agent",
-}
 
 
 @pytest.mark.parametrize("choice", CHOICES)
@@ -78,13 +69,6 @@ def test_the_chosen_model_is_played(type_enjoy, choice):
     assert (code, err, len(episodes(out))) == (0, "", 3)
     assert out.splitlines()[0] == f"random on {LAKE}: {RUN}/{CHOICES[choice]}"
     assert re.search(r"^return [\d.]+ \(sampled, 3 episodes\)   length [\d.]+$", out, re.M)
-
-
-@pytest.mark.parametrize("words", REFUSED)
-def test_one_line_for_what_is_not_there_or_not_done(type_enjoy, words):
-    code, _, err = type_enjoy("enjoy.py", *PAIR, *words.split())
-    assert (code, err.count("\n")) == (2, 1)
-    assert REFUSED[words] in err
 
 
 def test_letters_and_films_of_each_step(type_command, tmp_path):

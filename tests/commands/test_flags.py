@@ -5,8 +5,7 @@ import re
 import pytest
 
 from rl_yardstick.agents import ALGORITHMS
-from rl_yardstick.commands import compare, enjoy, train, tune
-from rl_yardstick.commands.cli import _INSTEAD
+from rl_yardstick.commands import compare, train, tune
 from rl_yardstick.commands.compare import study_spec
 from rl_yardstick.commands.train import spec_from_flags
 from rl_yardstick.commands.tune import tuning_spec
@@ -16,7 +15,6 @@ from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.spec import TrainSpec
 
-TRAIN, ENJOY, COMPARE = train, enjoy, compare
 LAKE = ["--env", "FrozenLake-v1"]
 
 
@@ -93,13 +91,13 @@ def test_the_file_of_a_map_is_in_the_titles_and_not_in_the_folders(tmp_path):
 
 
 MEANINGS = [
-    (TRAIN, "-n", {"1e5": 100_000, "100_000": 100_000, "-1": -1}, "0 -5 1.5 nan inf text 1e13"),
-    (TRAIN, "--seed", {"-1": -1, "0": 0, "4294967295": 2**32 - 1}, "-7 4294967296 1.5"),
-    (TRAIN, "--eval-freq", {"-1": -1, "0": 0, "-3": -3, "1e4": 10_000}, "1.5 nan"),
-    (TRAIN, "--num-threads", {"-1": -1, "4": 4}, "-2 1025 text"),
-    (COMPARE, "--seeds", {"1e1": 10}, "0 -1 1000001"),
-    (COMPARE, "--margin", {"0": 0.0, "0.5": 0.5}, "-1 nan inf"),
-    (COMPARE, "--name", {"my study": "my study"}, ".. a/b / CON a:b nul.txt"),
+    (train, "-n", {"1e5": 100_000, "100_000": 100_000, "-1": -1}, "0 -5 1.5 nan inf text 1e13"),
+    (train, "--seed", {"-1": -1, "0": 0, "4294967295": 2**32 - 1}, "-7 4294967296 1.5"),
+    (train, "--eval-freq", {"-1": -1, "0": 0, "-3": -3, "1e4": 10_000}, "1.5 nan"),
+    (train, "--num-threads", {"-1": -1, "4": 4}, "-2 1025 text"),
+    (compare, "--seeds", {"1e1": 10}, "0 -1 1000001"),
+    (compare, "--margin", {"0": 0.0, "0.5": 0.5}, "-1 nan inf"),
+    (compare, "--name", {"my study": "my study"}, ".. a/b / CON a:b nul.txt"),
 ]
 
 
@@ -138,44 +136,7 @@ def test_an_engine_is_a_setting_where_there_is_a_choice(tmp_path):
         assert {agent.settings.get("engine") for agent in agents} == expected
 
 
-def test_what_is_refused_by_every_command():
-    complaint = "--engine auto and -params engine:compiled disagree: give one of them"
-    words = ["-n", "10", "-params", "engine:compiled", "--engine", "auto"]
-    # Another agent of the study may have what this one has not.
-    for ask in (
-        lambda: trained("--algo", "ppo", *words),
-        lambda: compared(*LAKE, "--algos", "sarsa", "ppo", *words),
-        lambda: tuned("--algo", "ppo", *words),
-    ):
-        with pytest.raises(UserError, match=f"^{re.escape(complaint)}$"):
-            ask()
-
-
-def answer(module, words):
-    with pytest.raises(UserError) as mistake:
-        module.build_parser().parse_args(words.split(" "))
-    return str(mistake.value)
-
-
-MEANT = [
-    (TRAIN, "--lr 0.1", "behind -params: -params learning_rate:0.1 "),
-    (TRAIN, "--epsilon 0.1 --algo dqn", "-params exploration_final_eps:0.1 "),
-    (TRAIN, "-yaml x.yml", "did you mean '--conf-file'?"),
-    (ENJOY, "--gamma 0.9", "hyperparameters can only be set in train: -params gamma:0.9 "),
-    (COMPARE, "--seed 3", "did you mean '--seeds'?"),
-    (COMPARE, "--see 3", "unknown argument --see"),  # no abbreviation is taken
-]
-
-
-def test_what_was_meant():
-    for module, words, meant in MEANT:
-        assert meant in answer(module, words)
-    for flag, said in _INSTEAD.items():  # what rl_zoo3 has
-        assert f"unknown argument {flag} 1: {said}" in answer(TRAIN, f"{flag} 1")
-
-
 # What may be typed beside --resume: nothing that the run has already, not even as it has it.
-
 ALLOWED = {"--gym-packages": "math", "--log-folder": "logs", "--verbose": "0", "--progress": None}
 OTHERS = {"--engine": "auto", "--hyperparams": "gamma:0.9", "--eval-freq": "5"}
 OTHERS |= {"--eval-episodes": "5", "--env-kwargs": "a:1", "--eval-env-kwargs": "a:1"}

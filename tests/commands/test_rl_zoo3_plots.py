@@ -18,14 +18,8 @@ AGENTS = {
     "qlearning": [],
     "ppo": ["-params", "n_envs:1", "n_steps:32", "batch_size:32", "n_epochs:1"],
 }
-# rl_zoo3.enjoy needs `requests` for downloads, which are not made here.
 RUN = """
-import importlib.util, json, runpy, sys, types
-if importlib.util.find_spec("requests") is None:
-    stand_in = types.ModuleType("requests.exceptions")
-    stand_in.HTTPError = type("HTTPError", (OSError,), {})
-    sys.modules["requests"] = types.ModuleType("requests")
-    sys.modules["requests.exceptions"] = stand_in
+import json, runpy, sys
 for command in json.loads(sys.argv[1]):
     sys.argv = command
     runpy.run_module(command[0], run_name="__main__")

@@ -37,70 +37,62 @@ def exact(value, success, *yardstick, **more):
 POLE = Yardstick(optimum=500.0, baseline=20.0, at_least=480.0)
 NOTHING = "score 0   return 0   best random or constant policy"
 HIDES = HiddenState(95.8, (93.8, 93.8), with_memory=False)
-PULLS = {"n_pulls": 1000, "n_matched": 1000, "reward": 0.5, "optimal": 0.85}
-# The final evaluation, the pulls, and how the output ends.
 BEST = "best random or constant policy"
+# The final evaluation, and how the output ends.
 ENDS = [
     # Exact, optimal, nearly optimal.
     (
-        *(exact(0.740206, 0.740206, 0.744190, 0.0495), None),
+        exact(0.740206, 0.740206, 0.744190, 0.0495),
         "score 0.99   return 0.7402 of 0.7442 (gap 0.0040)   success 74 %",
         f"score 0   return 0.0495   {BEST}",
     ),
-    (exact(79 - 1e-14, 1.0, 79.0, 0.0), None, "score 1   return 79 of 79   success 100 %", NOTHING),
+    (exact(79 - 1e-14, 1.0, 79.0, 0.0), "score 1   return 79 of 79   success 100 %", NOTHING),
     (
-        *(exact(79 - 1e-9, 1 - 1e-4, 79.0, 0.0), None),
+        exact(79 - 1e-9, 1 - 1e-4, 79.0, 0.0),
         *("score 0.99   return 79 of 79 (gap 1e-09)   success 99.9 %", NOTHING),
     ),
     # Sampled, also between brackets, with a proof or not.
     (
-        *(sampled(78.5, 79.0, yardstick=Yardstick(79.0, 0.0)), None),
+        sampled(78.5, 79.0, yardstick=Yardstick(79.0, 0.0)),
         *("score 0.99   return 78.75 of 79 (gap 0.25; sampled, 2 episodes)", NOTHING),
     ),
     (
-        *(sampled(260.0, yardstick=POLE), None),
+        sampled(260.0, yardstick=POLE),
         "score 0.50 to 0.52   return 260 of 500 at most (sampled, 1 episode)",
         *(f"score 0   return 20   {BEST}", "optimum   480 to 500"),
     ),
     (
-        *(sampled(500.0, yardstick=replace(POLE, at_least=500.0, is_proven=False)), None),
+        sampled(500.0, yardstick=replace(POLE, at_least=500.0, is_proven=False)),
         "score 1   return 500 of 500 at most (not proven; sampled, 1 episode)",
         *(f"score 0   return 20   {BEST}", "optimum   500 (the upper end is not proven)"),
     ),
     # Far below the scale, without an optimum, without a scale.
     (
-        *(exact(-1000.0, None, -11.66, -12.0), None),
-        "score -2905.89   return -1000 of -11.66 (gap 988.34)",
-        f"score 0   return -12   {BEST}",
+        exact(-1000.0, None, -11.66, -12.0),
+        *("score -2905.89   return -1000 of -11.66 (gap 988.34)", f"score 0   return -12   {BEST}"),
     ),
-    (sampled(*[487.25] * 100), None, "return 487.2 (sampled, 100 episodes)"),
+    (sampled(*[487.25] * 100), "return 487.2 (sampled, 100 episodes)"),
     (
-        *(exact(749.5, None, 750.0, 750.0), None),
+        exact(749.5, None, 750.0, 750.0),
         *("return 749.5 of 750 (gap 0.5)", f"no score   return 750   {BEST}"),
     ),
     (
-        *(exact(-80.0, 1 / 15, 93.8, -40.0, 35.0, hidden=HIDES), None),
+        exact(-80.0, 1 / 15, 93.8, -40.0, 35.0, hidden=HIDES),
         "score -0.54 to -0.30   return -80 of 93.80 at most   success 6.7 %",
         f"score 0   return -40   {BEST}",
         "optimum   35 to 93.80 without memory, 93.80 with memory, 95.80 by the state",
     ),
-    # Bandits.
-    (
-        *(exact(159.0, None, 159.0, 117.0), PullSummary(regret=127.984, **PULLS)),
-        "regret 127.98 over 1,000 pulls   best arm in 85 % of the last 100",
-        *("score 1   return 159 of 159", f"score 0   return 117   {BEST}"),
-    ),
-    (
-        *(None, PullSummary(regret=None, **PULLS)),
-        "regret not known   reward 0.5000 a pull over the 1,000 of 1,000 that are in the log",
-    ),
 ]
+PULLS = PullSummary(n_pulls=1000, n_matched=1000, reward=0.5, optimal=0.85, regret=127.984)
 
 
 def test_how_a_run_ends():
-    for final, pulls, *lines in ENDS:
-        told = [] if pulls is None else [describe_pulls(pulls)]
-        assert told + ([] if final is None else result_lines(final)) == lines
+    for final, *lines in ENDS:
+        assert result_lines(final) == lines
+    said = "regret 127.98 over 1,000 pulls   best arm in 85 % of the last 100"
+    assert describe_pulls(PULLS) == said
+    said = "regret not known   reward 0.5000 a pull over the 1,000 of 1,000 that are in the log"
+    assert describe_pulls(replace(PULLS, regret=None)) == said
 
 
 def test_what_to_type_next(monkeypatch):
@@ -158,8 +150,8 @@ def test_scripts_that_a_queue_starts_again(type_command, tmp_path):
     assert "is finished already" in err
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_command_and_tells_how_to_resume(type_command, tmp_path, number):
+def test_a_signal_ends_a_command_and_tells_how_to_resume(type_command, tmp_path):
+    """The other one is sent to a study, see ``test_compare_command.py``."""
     words = [sys.executable, TRAIN, "--env", "CartPole-v1", "--algo", "ppo", "-n", "10000000"]
     process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     state = tmp_path / "logs/ppo/CartPole-v1_1/state.bin"
@@ -169,10 +161,10 @@ def test_a_signal_ends_a_command_and_tells_how_to_resume(type_command, tmp_path,
     code, _, err = type_command("train.py", "--resume", state.parent)
     assert (code, err.count("\n")) == (2, 1)
     assert f"is in use by another command, process {process.pid}" in err
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=100)
-    assert process.returncode == 128 + number
+    assert process.returncode == 128 + signal.SIGTERM
     assert f"stopped; resume with: python {TRAIN} --resume logs/ppo/CartPole-v1_1" in out
     record = json.loads((state.parent / "run.json").read_text())
-    assert (record["state"], record["stopped_by"]) == ("interrupted", number)
+    assert (record["state"], record["stopped_by"]) == ("interrupted", signal.SIGTERM)
     assert (state.parent / "CartPole-v1.zip").exists()

@@ -10,8 +10,6 @@ program looks at commits before and after modules have moved. ``--only 'train Ta
 looks at a part.
 """
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import fnmatch
@@ -21,10 +19,9 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from importlib.metadata import version
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -34,13 +31,15 @@ LIBRARIES = (
     *("stable-baselines3", "torch"),
 )
 SHOWN = 160  # characters of a value in a difference
+NOT_HERE = "not comparable here: "
 
 
-def main() -> int:
+def main():
     """Record, or compare; the exit code."""
     arguments = _parse()
     found = look(arguments.root, arguments.only)
-    print(f"{len(found.values)} entries, {sum(found.seconds.values()):.0f} s of processor time")
+    spent = sum(seconds for _, _, seconds in found.values())
+    print(f"{len(found)} entries, {spent:.0f} s of processor time")
     if arguments.record:
         record(found, arguments.only)
         return 0
@@ -50,21 +49,11 @@ def main() -> int:
     return int(any(not line.startswith(NOT_HERE) for line in lines))
 
 
-NOT_HERE = "not comparable here: "
+def look(root, patterns):
+    """Look at a checkout, in a new process that imports its packages and no others of that name.
 
-
-class Found:
-    """What was looked at: values, where they hold, and what it took, by names."""
-
-    def __init__(self, lines: list[str]) -> None:
-        rows = [json.loads(line) for line in lines]
-        self.values: dict[str, Any] = {name: value for name, _, value, _ in rows}
-        self.holds: dict[str, str] = {name: holds for name, holds, _, _ in rows}
-        self.seconds: dict[str, float] = {name: spent for name, _, _, spent in rows}
-
-
-def look(root: Path, patterns: list[str]) -> Found:
-    """Look at a checkout, in a new process that imports its packages and no others of that name."""
+    By name: where a value holds, the value, and the seconds that it took.
+    """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "found.jsonl"
         threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
@@ -76,10 +65,11 @@ def look(root: Path, patterns: list[str]) -> Found:
             env=env | threads | own | {"PYTHONPATH": str(root.resolve())},
             check=True,
         )
-        return Found(out.read_text(encoding="utf-8").splitlines())
+        rows = map(json.loads, out.read_text(encoding="utf-8").splitlines())
+        return {name: tuple(row) for name, *row in rows}
 
 
-def facts() -> dict[str, str]:
+def facts():
     """What values depend on that do not hold anywhere."""
     import torch as th
 
@@ -91,20 +81,18 @@ def facts() -> dict[str, str]:
     }
 
 
-def record(found: Found, patterns: list[str]) -> None:
+def record(found, patterns):
     """Write the file of results, a line for each entry or for each line of its text."""
-    holds, values, here = found.holds, found.values, facts()
+    values, here = {name: (holds, value) for name, (holds, value, _) in found.items()}, facts()
     if patterns != ["*"] and GOLDEN.exists():  # those that were not looked at stay
         before = json.loads(GOLDEN.read_text(encoding="utf-8"))
-        if blocked(before["facts"]) & set(holds.values()):
+        if blocked(before["facts"]) & {holds for holds, _ in values.values()}:
             raise SystemExit("the other entries are of another machine: record all, without --only")
         here = before["facts"]
         for where, entries in before["entries"].items():
-            for name, value in entries.items():
-                if not matches(name, patterns):
-                    values[name], holds[name] = value, where
+            values |= {n: (where, v) for n, v in entries.items() if not matches(n, patterns)}
     entries = {
-        where: {name: values[name] for name in sorted(values) if holds[name] == where}
+        where: {name: values[name][1] for name in sorted(values) if values[name][0] == where}
         for where in ("anywhere", "python", "here")
     }
     text = json.dumps({"facts": here, "entries": entries}, indent=0, ensure_ascii=False)
@@ -112,24 +100,24 @@ def record(found: Found, patterns: list[str]) -> None:
     print(f"{GOLDEN.name}: {len(text) / 1000:.0f} kB")
 
 
-def blocked(recorded: dict[str, str]) -> set[str]:
+def blocked(recorded):
     """Where entries hold that cannot be compared with recorded facts."""
     now = facts()
     python = {"python"} if now["python"] != recorded["python"] else set()
     return python | ({"here"} if now != recorded else set())
 
 
-def matches(name: str, patterns: list[str]) -> bool:
+def matches(name, patterns):
     """Whether a name is one of those that are looked at."""
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def differences(recorded: dict[str, Any], found: Found, patterns: list[str]) -> Iterator[str]:
+def differences(recorded, found, patterns):
     """A line for each difference, and for each thing that cannot be compared here."""
     here = facts()
     changed_facts = [name for name, value in recorded["facts"].items() if here[name] != value]
     incomparable = blocked(recorded["facts"])
-    left = dict(found.values)
+    left = {name: value for name, (_, value, _) in found.items()}
     for where, entries in recorded["entries"].items():
         skipped = 0
         for name, was in entries.items():
@@ -147,7 +135,7 @@ def differences(recorded: dict[str, Any], found: Found, patterns: list[str]) -> 
         yield f"{name}: is new; {sys.executable} tests/golden --record --only {name!r}"
 
 
-def changes(name: str, was: Any, now: Any) -> Iterator[str]:
+def changes(name, was, now):
     """What was and what is, in a line for each line that has changed."""
     if was == now:
         return
@@ -159,19 +147,18 @@ def changes(name: str, was: Any, now: Any) -> Iterator[str]:
         matcher = difflib.SequenceMatcher(a=was, b=now, autojunk=False)
         for kind, first, last, begin, end in matcher.get_opcodes():
             if kind != "equal":
-                old, new = was[first:last], now[begin:end]
-                for i in range(max(len(old), len(new))):
-                    before, after = (shown(x[i]) if i < len(x) else "nothing" for x in (old, new))
+                old, new = map(shown, was[first:last]), map(shown, now[begin:end])
+                for before, after in zip_longest(old, new, fillvalue="nothing"):
                     yield f"{name}: was {before}, is {after}"
 
 
-def shown(value: Any) -> str:
+def shown(value):
     """A value, cut where it is long."""
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
-def _parse() -> argparse.Namespace:
+def _parse():
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--root", type=Path, default=ROOT, help="another checkout than this one")
     parser.add_argument("--record", action="store_true", help=f"write {GOLDEN.name}")

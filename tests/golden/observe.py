@@ -4,12 +4,12 @@ The checkout's packages come first on the import path. Each thing that was looke
 JSON in OUT: its name, where its value holds, the value, and the seconds of processor time it took.
 """
 
-import fnmatch
 import json
 import os
 import sys
 import tempfile
 import warnings
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 
@@ -26,9 +26,7 @@ def main():
 
         things = [*results.things(Path(root).resolve(), place), *trained.things(place)]
         wanted = {
-            thing.name
-            for thing in things
-            if any(fnmatch.fnmatchcase(thing.name, pattern) for pattern in patterns)
+            thing.name for thing in things if any(fnmatchcase(thing.name, p) for p in patterns)
         }
         needed = with_needs(things, wanted)
         with Path(out).open("w", encoding="utf-8") as file, warnings.catch_warnings():
@@ -36,29 +34,22 @@ def main():
             for thing in things:
                 if thing.name not in needed:
                     continue
-                start = os.times()
+                before = sum(os.times()[:4])  # with those processes that it has waited for
                 try:
                     found = thing.look()
                 except Exception as error:  # noqa: BLE001  # that is what becomes of it
                     found = f"{type(error).__name__}: {error}"
                 if thing.name in wanted:
-                    line = [thing.name, thing.holds, found, spent(start, os.times())]
+                    spent = round(sum(os.times()[:4]) - before, 2)
+                    line = [thing.name, thing.holds, found, spent]
                     print(json.dumps(line), file=file, flush=True)
 
 
 def with_needs(things, wanted):
     """The names that are wanted, and of those things that have to be done before."""
-    while True:
-        groups = tuple({thing.needs for thing in things if thing.name in wanted and thing.needs})
-        more = wanted | {thing.name for thing in things if thing.name.startswith(groups)}
-        if not groups or more == wanted:
-            return wanted
-        wanted = more
-
-
-def spent(before, after):
-    """Processor time between two moments, of this process and of those that it has waited for."""
-    return round(sum(after[:4]) - sum(before[:4]), 2)
+    groups = tuple({thing.needs for thing in things if thing.name in wanted and thing.needs})
+    more = wanted | {thing.name for thing in things if thing.name.startswith(groups)}
+    return wanted if more == wanted else with_needs(things, more)
 
 
 if __name__ == "__main__":

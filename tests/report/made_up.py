@@ -12,6 +12,7 @@ from rl_yardstick.experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyRe
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.verdicts import AgentRuns, Best, Estimate, Pair, Study, Summary, ThresholdSummary
 
+HOSTILE = "</script><script>document.title='taken'</script>"
 NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
@@ -114,3 +115,46 @@ def pulls(start, n=(1, 10, 100), n_runs=4):
         moments=np.empty(0, dtype=np.int64),
         **dict.fromkeys(unknown, nothing),
     )
+
+
+def trial(number, value, figures, state="complete", failure=None, **params):
+    """A trial of a tuning, as its record has it."""
+    at = f"2026-01-01T00:{{:02d}}:{number % 60:02d}"
+    told = {"number": number, "state": state, "value": value, "failure": failure}
+    told |= {"params": {"rate": 0.1, "kind": "a", "steps": 3} | params, "figures": figures}
+    more = {"tau": 1.0} if number == 2 else {}
+    told["settings"] = {"learning_rate": number, "gamma": 0.9, **more}
+    return told | {"seconds": 2.0 * len(figures), "began": at.format(0), "ended": at.format(1)}
+
+
+def tuning():
+    """What a tuning wrote down."""
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+    from optuna.distributions import distribution_to_json as as_json
+
+    space = {"rate": as_json(FloatDistribution(0.01, 1.0, log=True))}
+    space["kind"] = as_json(CategoricalDistribution(["a", None, True]))
+    space["steps"] = as_json(IntDistribution(1, 5))
+    interval = {"point": 0.5, "low": 0.4, "high": 0.6, "n": 4, "n_missing": 0}
+    shipped = {"label": "shipped", "number": 0, "held_out": 0.5, "in_search": 0.6, "verdict": ""}
+    shipped |= {"n_runs": 4, "n_failed": 1, "interval": interval}
+    winner = {**shipped, "label": "trial 2", "number": 2, "held_out": 0.7}
+    winner["verdict"] = "better so far"
+    retest = {"settings": [shipped, winner], "winner": "trial 2", "winner_file": "winner.yml"}
+    record = {"name": "t", "command": "python tune.py <script>", "widened": ["rate"]}
+    record |= {"figure": "score", "objective": "mean", "lower_is_better": False, "n_trials": 10}
+    record |= {"n_at_optimum": 0, "seeds": [1, 0], "held_out_seeds": [1000, 1001]}
+    record |= {"retest": {**retest, "reason": "", "optimism": 0.1}}
+    asked = {"algo": "dqn", "env": "Toy-v0", "sampler": "tpe", "pruner": "auto"}
+    return record | {
+        "asked": {**asked, "search_space": space},
+        "trials": [
+            trial(0, 0.6, {"1": 0.6, "0": 0.6}),
+            trial(1, -30.0, {"1": -30.0}, "pruned", rate=1.0),
+            trial(2, 0.8, {"1": 0.8, "0": 0.8}, kind=None),
+            trial(3, 0.7, {"1": 0.7, "0": 0.7}, steps=5),
+            trial(4, None, {}, "pruned", failure="it broke"),
+            trial(5, None, {}, "running"),
+            trial(6, 0.75, {"1": 0.75}, "pruned", kind=True),
+        ],
+    }

@@ -15,8 +15,7 @@ from rl_yardstick.pipeline.run import Stop
 from rl_yardstick.report.page import learning
 from rl_yardstick.report.page.frame import as_json
 from rl_yardstick.report.page.learning import exactly, write_first_pages, write_learning_page
-
-HOSTILE = "</script><script>document.title='taken'</script>"
+from tests.report.made_up import HOSTILE
 
 
 @pytest.fixture

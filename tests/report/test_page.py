@@ -18,11 +18,8 @@ from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.report.films import MAX_BYTES, MAX_SIDE, film_of
 from rl_yardstick.report.page import render, world_sections
 from rl_yardstick.report.page.frame import Report
-from rl_yardstick.report.series import (
-    study_series,
-)
-
-HOSTILE = "</script><script>document.title='taken'</script>"
+from rl_yardstick.report.series import study_series
+from tests.report.made_up import HOSTILE
 
 SECTION_NAMES = [
     *("verdict", "overview", "ranking", "curves", "comparison", "overall"),

@@ -16,6 +16,8 @@ from selenium.webdriver.support.ui import Select, WebDriverWait
 
 from rl_yardstick.report.page.learning import write_learning_page
 from rl_yardstick.report.page.tuning import write_tuning_page
+from tests.report import made_up
+from tests.report.made_up import HOSTILE
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -26,15 +28,13 @@ pytestmark = pytest.mark.skipif(
 )
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run")
 FLAGS += ("--disable-background-networking", "--disable-component-update", "--disable-sync")
-HOSTILE = "</script><script>document.title='taken'</script>"
 
 
 class Browser:
     """What tests do with a page."""
 
     def __init__(self, profile):
-        assert BROWSER is not None, "the report has to be tested in Chromium: install it"
-        assert DRIVER is not None, "the report has to be tested in Chromium: install chromedriver"
+        assert None not in (BROWSER, DRIVER), "install Chromium and chromedriver"
         options = webdriver.ChromeOptions()
         options.binary_location = BROWSER
         for flag in (*FLAGS, f"--user-data-dir={profile}"):
@@ -191,9 +191,9 @@ def test_nothing_lies_beyond_the_edge_of_a_phone(browser, report_study):
         browser.fits(320)
 
 
-def test_the_page_of_a_search_draws_and_fits_a_telephone(browser, tuning_record, tmp_path):
+def test_the_page_of_a_search_draws_and_fits_a_telephone(browser, tmp_path):
     path = tmp_path / "report.html"
-    write_tuning_page(tuning_record, path, "retest/report.html")
+    write_tuning_page(made_up.tuning(), path, "retest/report.html")
     browser.load(path, 390)
     browser.plots(3)
     assert len(browser.all(".js-plotly-plot")) == 3

@@ -15,6 +15,7 @@ from rl_yardstick.report.page.tuning import (
     importances,
     write_tuning_page,
 )
+from tests.report import made_up
 
 
 def shown_of(record):
@@ -22,8 +23,8 @@ def shown_of(record):
     return json.loads(as_json(history(Trials(record))))
 
 
-def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
-    shown = shown_of(tuning_record)
+def test_the_history_has_the_best_of_those_with_all_seeds():
+    shown = shown_of(made_up.tuning())
     assert shown["numbers"] == [0, 1, 2, 3, 4, 6]
     assert shown["best"] == [0.6, 0.6, 0.8, 0.8, 0.8, 0.8]
     assert shown["values"]["judged on all seeds"] == [0.6, None, 0.8, 0.7, None, None]
@@ -32,13 +33,11 @@ def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
     assert shown["texts"][1] == "trial 1: -30 on 1 seed"
     # The one far off lies beyond the edge of the axis, and all others inside.
     assert -30.0 < shown["edge"] < 0.6
-    assert shown_of({**tuning_record, "lower_is_better": True})["best"] == [0.6] * 6
+    assert shown_of({**made_up.tuning(), "lower_is_better": True})["best"] == [0.6] * 6
 
 
-def test_trials_are_ranked_by_value_and_those_with_the_optimum_by_their_steps(
-    tuning_record, tuning_trial
-):
-    trials = [tuning_trial(n, 1.0, {"1": 1.0, "0": 1.0}) for n in range(4)]
+def test_trials_are_ranked_by_value_and_those_with_the_optimum_by_their_steps():
+    trials = [made_up.trial(n, 1.0, {"1": 1.0, "0": 1.0}) for n in range(4)]
     for number, steps in ((1, (30, 50)), (3, (20, 40)), (2, (1,))):
         trials[number]["at_optimum"] = dict(zip(("1", "0"), steps, strict=False))
     for fields, ranked in (
@@ -46,26 +45,23 @@ def test_trials_are_ranked_by_value_and_those_with_the_optimum_by_their_steps(
         ({"lower_is_better": True}, [0, 3, 2, 1, 4, 6]),
         ({"trials": trials}, [3, 1, 0, 2]),
     ):
-        found = Trials({**tuning_record, **fields}).best_first
+        found = Trials({**made_up.tuning(), **fields}).best_first
         assert [trial["number"] for trial in found] == ranked
 
 
-def test_the_parameter_that_decides_matters_most(tuning_record, tuning_trial):
+def test_the_parameter_that_decides_matters_most():
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(0))
-    space = Trials(tuning_record).distributions
-    drawn = [study.ask(space).params for _ in range(60)]
-    tuning_record["trials"] = [
-        tuning_trial(number, -abs(params["steps"] - 3), {"1": 0.0}, **params)
-        for number, params in enumerate(drawn)
-    ]
-    shares = importances(Trials(tuning_record))
+    space = Trials(made_up.tuning()).distributions
+    drawn = enumerate(study.ask(space).params for _ in range(60))
+    trials = [made_up.trial(n, -abs(each["steps"] - 3), {"1": 0.0}, **each) for n, each in drawn]
+    shares = importances(Trials({**made_up.tuning(), "trials": trials}))
     assert next(iter(shares)) == "steps"
     assert shares["steps"] > 0.7
     assert sum(shares.values()) == pytest.approx(1.0)
 
 
-def test_tables_have_the_cost_and_what_changed(tuning_record):
-    trials = Trials(tuning_record)
+def test_tables_have_the_cost_and_what_changed():
+    trials = Trials(made_up.tuning())
     assert cost(trials) == [
         ("Trials", "6 of 10"),
         ("Ended early", "2"),
@@ -80,10 +76,10 @@ def test_tables_have_the_cost_and_what_changed(tuning_record):
     assert changes(trials, 2) == [("learning_rate", "0", "2"), ("tau", "-", "1.0")]
 
 
-def test_the_page_is_one_file_that_says_what_won(tuning_record, tmp_path):
+def test_the_page_is_one_file_that_says_what_won(tmp_path):
     def page(**changes):
-        path, record = tmp_path / "report.html", json.loads(json.dumps(tuning_record | changes))
-        write_tuning_page(record, path, "retest/report.html")
+        path = tmp_path / "report.html"
+        write_tuning_page(made_up.tuning() | changes, path, "retest/report.html")
         text = path.read_text(encoding="utf-8")
         return text, re.findall(r'<section id="(\w+)"', text)
 
