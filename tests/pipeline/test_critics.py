@@ -1,6 +1,5 @@
 """What `--diagnose` compares, by hand, by finite differences and by many rollouts."""
 
-import csv
 from dataclasses import replace
 
 import gymnasium as gym
@@ -24,16 +23,7 @@ from rl_yardstick.pipeline.evaluation.critics import (
 )
 from rl_yardstick.pipeline.evaluation.policies import own_values, policy_matrix
 from tests.envs.corridors import Corridor
-from tests.pipeline.short_runs import LAKE, agent_of, run_of, spec_of
-from tests.pipeline.test_resuming import content
-from tests.pipeline.test_resuming import spec_of as resumable
-
-PPO = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2, "gae_lambda": 0.8}
-
-
-def rows_of(run):
-    with (run.path / "diagnosis.csv").open() as file:
-        return [{k: float(v or "nan") for k, v in row.items()} for row in csv.DictReader(file)]
+from tests.pipeline.short_runs import LAKE, agent_of, spec_of
 
 
 def chain_world():
@@ -231,30 +221,6 @@ def test_cosine_and_signal_to_noise_of_multiples_of_the_exact_gradient(corridor_
         found = recorder.gradient_figures(true, states, actions, batches)
         assert found["gradient_cosine"] == pytest.approx(cosine, abs=1e-4)
         assert found["gradient_snr"] == pytest.approx(ratio, rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("algo", "settings", "eval_freq", "column"),
-    [
-        ("qlearning", {"engine": "compiled"}, None, "overestimation"),
-        ("ppo", {**PPO, "engine": "library"}, 70, "gradient_cosine"),
-        ("ppo", {**PPO, "engine": "compiled"}, 100, "gae_bias"),
-    ],
-)
-def test_the_agent_is_the_same_to_the_last_bit(
-    tmp_path, monkeypatch, algo, settings, eval_freq, column
-):
-    spec = resumable(LAKE, algo, 400, settings, eval_freq=eval_freq)
-    plain, _ = run_of(spec, tmp_path / "plain")
-    spec = spec.changed(diagnose=True)
-    whole, _ = run_of(spec, tmp_path / "whole")
-    for path in sorted(plain.path.rglob("*.zip")):
-        again = whole.path / path.relative_to(plain.path)
-        assert content(path) == content(again), path.name
-    assert not (plain.path / "diagnosis.csv").exists()
-    rows = rows_of(whole)
-    assert len(rows) >= (1 if eval_freq is None else 4)
-    assert np.isfinite([row[column] for row in rows[:4]]).all()
 
 
 def test_where_states_look_alike_values_are_compared_and_rollouts_are_not():

@@ -9,7 +9,6 @@ import pytest
 import torch as th
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
 
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.compiled import engine
@@ -27,8 +26,7 @@ from rl_yardstick.pipeline.evaluation.sampled import (
     evaluation_seed,
 )
 from rl_yardstick.pipeline.settings import HYPERPARAMS, TUNED_ON, read_yaml
-from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of, trained
-from tests.pipeline.test_resuming import content
+from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of
 
 CAR = "MountainCar-v0"
 PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
@@ -78,28 +76,6 @@ def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_strea
         for seeds in (range(10), range(1000, 1010))
     )
     assert not tuned & judged
-
-
-NORMALIZED = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 32, "batch_size": 32}
-NORMALIZED |= {"n_epochs": 2, "n_envs": 2, "normalize": True}
-
-
-def test_training_is_the_same_with_and_without_evaluations(tmp_path):
-    common = {"n_timesteps": 400, "folder": tmp_path, "eval_episodes": 3}
-    (often, found), (never, none) = (
-        trained("ppo", CART, NORMALIZED, eval_freq=n, **common) for n in (40, -1)
-    )
-    assert len(np.load(often.path / "evaluations.npz")["timesteps"]) >= 10
-    assert not (never.path / "evaluations.npz").exists()
-    assert (found.final is None, none.final is None) == (False, True)
-    for name in (f"{CART}.zip", "0.monitor.csv", "1.monitor.csv"):
-        assert content(often.path / name) == content(never.path / name), name
-    found, other = (
-        VecNormalize.load(str(each.path / CART / "vecnormalize.pkl"), make_vec_env(CART, 1))
-        for each in (often, never)
-    )
-    assert (found.obs_rms.mean == other.obs_rms.mean).all()
-    assert found.ret_rms.var == other.ret_rms.var
 
 
 class Steady(gym.Env):

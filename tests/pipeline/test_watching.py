@@ -18,7 +18,6 @@ from rl_yardstick.pipeline.evaluation.value_maps import value_map
 from rl_yardstick.pipeline.pictures import read_monitors
 from rl_yardstick.pipeline.watching import TERMINATED, TableRecorder
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, run_of, spec_of, trained
-from tests.pipeline.test_resuming import content
 
 
 def watched_spec(algo="qlearning", settings=None, **fields):
@@ -62,23 +61,7 @@ def test_tables_with_a_number_for_each_action_come_first(name):
     assert recorder.has_actions
 
 
-def episodes_of(folder):
-    rows = (folder / "0.monitor.csv").read_text().splitlines()[2:]
-    return [row.split(",")[:2] for row in rows]
-
-
 SMALL_PPO = {"n_steps": 32, "batch_size": 32}
-
-
-@pytest.mark.parametrize(("algo", "settings"), [("qlearning", {}), ("ppo", SMALL_PPO)])
-def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
-    spec = watched_spec(algo, settings, n_timesteps=160)
-    alone, plain = run_of(spec.changed(watch_learning=None), tmp_path)
-    run, outcome = run_of(spec, tmp_path)
-    assert outcome.engine == plain.engine
-    for name in (f"{LAKE}.zip", "0.monitor.csv", "evaluations.npz"):
-        assert content(alone.path / name) == content(run.path / name), name
-    assert len(outcome.watch.steps if algo == "qlearning" else outcome.watch.moments) > 4
 
 
 def test_of_a_network_there_is_a_map_at_each_evaluation(tmp_path):
