@@ -33,7 +33,7 @@ from rl_yardstick.pipeline.environments import (
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.spec import Component
 from rl_yardstick.pipeline.training import make_agent
-from tests.pipeline.short_runs import CART, spec_of
+from tests.pipeline.short_runs import CART, TABLES, spec_of
 
 
 def world(env_id, entry=None):
@@ -188,22 +188,8 @@ def test_a_maps_rows_take_the_place_of_its_path_and_a_log_is_found_from_other_fo
 KINDS = (nn.Module, optim.Optimizer, BaseBuffer)
 CALLBACKS = "stable_baselines3.common.callbacks"
 
-NAMES = [
-    ("nn.Tanh", "Tanh"),
-    ("torch.nn.modules.activation.ReLU", "ReLU"),
-    ("th.optim.Adam", "Adam"),
-    ("RMSpropTFLike", "RMSpropTFLike"),
-    ("nn.Tahn", "Tahn does not exist: did you mean 'Tanh'"),
-    ("nn.functional.relu", "is no Module or Optimizer or BaseBuffer"),
-    ("th.load", "is in none of the packages"),
-    ("os.system", "is in none of the packages"),
-    ("rl_zoo3.utils.get_class_by_name", "is in none of the packages"),
-    ("gymnasium.wrapers.TimeLimit", "No module named 'gymnasium.wrapers'"),
-    ("print", "is in none of the packages"),
-]
 
-
-@pytest.mark.parametrize(("name", "found"), NAMES)
+@pytest.mark.parametrize(("name", "found"), TABLES["names"])
 def test_which_names_are_classes(name, found):
     if found in name:
         assert find_class(name, KINDS, "here", []).__name__ == found

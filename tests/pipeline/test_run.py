@@ -32,7 +32,7 @@ from rl_yardstick.pipeline.files import (
 )
 from rl_yardstick.pipeline.run import Run, Stop, numbered_runs
 from rl_yardstick.pipeline.training import train
-from tests.pipeline.short_runs import CART, LAKE, run_of, spec_of, trained
+from tests.pipeline.short_runs import CART, LAKE, TABLES, run_of, spec_of, trained
 
 
 @pytest.fixture(autouse=True)
@@ -262,17 +262,7 @@ def test_an_agent_that_learns_nonsense_is_not_saved():
     assert not list(Path("logs").rglob("CartPole-v1.zip"))
 
 
-@pytest.mark.parametrize(
-    ("algo", "entry", "said"),
-    [
-        ("ppo", {"n_episodes": 3, "learning_rate": "lin_0.1"}, "the schedules of ppo run by steps"),
-        ("ppo", {"policy": "CnnPolicy"}, "CnnPolicy"),
-        ("ppo", {"policy": "MlpPolcy"}, "unknown policy 'MlpPolcy': did you mean 'MlpPolicy'"),
-        ("ppo", {"policy_kwargs": {"net_arhc": [4]}}, "net_arhc"),
-        ("ppo", {"rollout_buffer_class": "HerReplayBuffer"}, "HerReplayBuffer"),
-        ("dqn", {"train_freq": [1, "day"]}, "day"),
-    ],
-)
+@pytest.mark.parametrize(("algo", "entry", "said"), TABLES["constructors"])
 def test_what_only_the_constructor_knows_is_one_line_and_leaves_no_folder(algo, entry, said):
     with pytest.raises(UserError) as caught:
         trained(algo, CART, entry, n_timesteps=64)
