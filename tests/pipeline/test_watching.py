@@ -150,7 +150,8 @@ def test_an_action_among_several_best_ones_does_not_differ():
 def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(tmp_path):
     entry = {"learning_rate": 0.5, "env_kwargs": {"slip": 0.2}}
     kept = {"n_timesteps": 450, "eval_freq": 100, "save_freq": 100, "pictures": True}
-    run, _ = trained("qlearning", WAREHOUSE, entry, folder=tmp_path, **kept)
+    kept["diagnose"] = True
+    run, outcome = trained("qlearning", WAREHOUSE, entry, folder=tmp_path, **kept)
     with np.load(run.path / "value_maps.npz") as file:
         maps = dict(file)
     assert maps["timesteps"].tolist() == [100, 200, 300, 400, 450]
@@ -167,7 +168,10 @@ def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(tmp_path):
     with np.load(run.path / "evaluations.npz") as evaluations:
         at_start = maps["values"][:-1] @ evaluator.model.initial
         np.testing.assert_allclose(at_start, evaluations["results"][:, 0], rtol=1e-12)
-    assert (run.path / "value_map.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("learning_curve.png", "value_map.png"):
+        assert (run.path / name).stat().st_size > 5000
+        assert (run.path / name).read_bytes().startswith(b"\x89PNG")
+    assert outcome.can_be_explained
 
 
 def test_the_episodes_of_several_environments_in_the_order_in_which_they_ended(tmp_path):
