@@ -31,7 +31,7 @@ def results_of(study, root, ends=ENDS, counts=None):
     planned = plan(study, root, counts)
     rows = []
     for run in planned:
-        end = ends[run.agent][run.seed]
+        end = ends[run.agent][run.seed - study.first_seed]
         if end is not None:
             row = {"agent": run.agent, "environment": run.environment, "env_id": run.spec.env_id}
             row |= {"seed": run.seed, "final": float(end), "area": float(end), "score": end / 100}
@@ -50,13 +50,13 @@ def next_counts(said):
     return {(agent, e): n for e, by in said.seeds.items() for agent, n in by.items()}
 
 
-def grow(study, root, most=None, steps=99, ends=ENDS):
+def grow(study, root, most=None, steps=99):
     """What the command does, with made-up runs; the verdicts after each look."""
     looks = plan_of_looks(study, root, most)
     StudyRecord(study, {}, looks).write(root)
     counts, found = {(agent.label, "lake"): study.n_seeds for agent in study.agents}, []
     for _ in range(steps):
-        now = results_of(grown(study, counts), root, ends, counts)
+        now = results_of(grown(study, counts), root, counts=counts)
         found.append(looked(now, looks))
         if found[-1].is_done:
             break

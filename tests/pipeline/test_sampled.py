@@ -25,7 +25,6 @@ from rl_yardstick.pipeline.evaluation.sampled import (
     evaluate_compiled,
     evaluation_seed,
 )
-from rl_yardstick.pipeline.settings import HYPERPARAMS, TUNED_ON, read_yaml
 from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of
 
 CAR = "MountainCar-v0"
@@ -36,9 +35,8 @@ def figures(evaluation):
     return evaluation.returns.tolist(), evaluation.lengths.tolist()
 
 
-def episodes(*returns, length=10, yardstick=None, successes=None):
-    lengths = np.full(len(returns), length)
-    return Evaluation(np.array(returns, float), lengths, successes, yardstick=yardstick)
+def episodes(*returns, yardstick):
+    return Evaluation(np.array(returns), np.full(len(returns), 10), None, yardstick=yardstick)
 
 
 def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile():
@@ -53,29 +51,22 @@ def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile():
     assert all(a != b for i, a in enumerate(different) for b in different[:i])
 
 
-def seeds_of_run(n_envs, seed, n_eval_envs=10):
-    """All seeds of environments, of action spaces and of the agent."""
-    starts = [evaluation_seed(seed, purpose) for purpose in PURPOSES]
-    evaluations = (range(start, start + n_eval_envs) for start in starts)
-    return {seed, *range(seed * n_envs, (seed + 1) * n_envs)}.union(*evaluations)
-
-
 def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_stream():
     starts = [[seed, *(evaluation_seed(seed, p) for p in PURPOSES)] for seed in range(500)]
     evaluations = [start for row in starts for start in row[1:]]
     assert all(0 <= seed < 2**31 for seed in evaluations)
     assert len(set(evaluations)) == len(evaluations)
     assert all(min(np.diff(sorted(row))) > 100 for row in starts)  # environments
-    # With every shipped entry, and with any two of them: runs of one study may be of several.
-    files = sorted(HYPERPARAMS.glob("*.yml"))
-    entries = [entry for path in files for key, entry in read_yaml(path).items() if key != TUNED_ON]
-    numbers = {entry.get("n_envs", 1) for entry in entries}
-    assert numbers == {1, 4, 8, 16, 32}
-    tuned, judged = (
-        set().union(*(seeds_of_run(n_envs, seed) for n_envs in numbers for seed in seeds))
-        for seeds in (range(10), range(1000, 1010))
-    )
-    assert not tuned & judged
+
+    def seeds_of_runs(seeds):
+        """Of agents and evaluations, and of environments of any two entries."""
+        begun = [
+            evaluation_seed(seed, p) + i for seed in seeds for p in PURPOSES for i in range(10)
+        ]
+        environments = (range(seeds.start * n, seeds.stop * n) for n in range(1, 33))
+        return {*seeds, *begun}.union(*environments)
+
+    assert not seeds_of_runs(range(10)) & seeds_of_runs(range(1000, 1010))
 
 
 class Steady(gym.Env):
@@ -84,7 +75,7 @@ class Steady(gym.Env):
     observation_space = gym.spaces.Discrete(2)
     action_space = gym.spaces.Discrete(2)
 
-    def __init__(self, returns=(1.0,), length=1):
+    def __init__(self, returns, length):
         self.returns, self.length = itertools.cycle(returns), length
 
     def reset(self, *, seed=None, options=None):
