@@ -297,14 +297,11 @@ SEEDS = [
 ]
 
 
-def tuned(agents, places=(TUNED,), first=0, count=10):
-    return tuning_seeds(study_of(*agents, environments=places, n_seeds=count, first_seed=first))
-
-
 @pytest.mark.parametrize(("agents", "places", "seeds", "sentence"), SEEDS)
 def test_what_is_said_of_the_seeds(agents, places, seeds, sentence):
     first, count = seeds
-    said = seed_sentence(range(first, first + count), tuned(agents, places, *seeds))
+    study = study_of(*agents, environments=places, n_seeds=count, first_seed=first)
+    said = seed_sentence(study.seeds, tuning_seeds(study))
     assert said.startswith(f"Seeds {first} to {first + count - 1}: ")
     assert sentence in said
     assert said.endswith(".")

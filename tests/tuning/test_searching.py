@@ -3,6 +3,7 @@
 import math
 import statistics
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from optuna.trial import create_trial
 from rl_yardstick.experiments.analysis import analyse, looked
 from rl_yardstick.experiments.results import RunResults
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.settings import read_entry, seeds_tuned_on
+from rl_yardstick.pipeline.settings import read_entry, read_yaml, seeds_tuned_on
 from rl_yardstick.tuning import retesting, searching
 from rl_yardstick.tuning.retesting import (
     Outcome,
@@ -39,6 +40,7 @@ from rl_yardstick.verdicts import Estimate, steps_to_threshold
 from tests.experiments.test_growing import results_of
 
 REAL_OUTCOME_OF, REAL_STORAGE = outcome_of, open_storage
+HOPELESS = read_yaml(Path(__file__).with_name("hopeless.yml"))
 
 
 def states(search):
@@ -210,37 +212,10 @@ def test_the_first_trial_and_the_best_one_go_on_and_the_worst_of_many_does_not()
     assert any(is_hopeless(scored([0.0] * n), better) for n in range(1, 12))
 
 
-TWO = [[0.9, 0.9, 1.0], [1.0, 0.2]]
-FAILED = [[0.9, 0.9, 0.9], [1.0, 0.1]]
-SHORT = [[0.9, 0.9]]
-# A score of 10 has been seen: with that, any trial could still win.
-NINE, TEN = ([[0.5] * n, [10.0]] for n in (9, 10))
-WORSE = [0.4, 0.39, 0.38, 0.37]
-
-
-@pytest.mark.parametrize(
-    ("scores", "others", "options", "hopeless"),
-    [
-        # What is left counts as perfect: 0.9 and twice 1.0 is more than 2.8, with 0.8 it is a draw.
-        ([0.8], TWO, {}, False),
-        ([1.0, 0.79], TWO, {}, True),
-        # A trial under way is no measure.
-        ([0.1], SHORT, {}, True),
-        ([0.1], SHORT, {"n_seeds": 3}, False),
-        # Perfect is the highest score that any trial has had.
-        ([-115.0], [[-110.0, -110.0], [-100.0, -200.0]], {}, False),
-        # Where the optimum is known nothing less is.
-        ([0.6], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, False),
-        ([0.05], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, True),
-        # One failed seed of three sinks a mean, and no median.
-        ([0.1], FAILED, {"value": statistics.median}, False),
-        ([0.1, 0.1], FAILED, {"value": statistics.median}, True),
-        # Ranks decide from ten seeds on.
-        (WORSE, NINE, {}, False),
-        (WORSE, TEN, {}, True),
-    ],
-)
+@pytest.mark.parametrize(("scores", "others", "options", "hopeless"), HOPELESS)
 def test_what_is_hopeless(scores, others, options, hopeless):
+    if "value" in options:
+        options = {"value": statistics.median}
     found = is_hopeless(scored(scores), [scored(each) for each in others], **options)
     assert found is hopeless
 
