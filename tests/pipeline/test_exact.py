@@ -86,17 +86,11 @@ class Lookup:
         return self.actions[observation], None
 
 
-@pytest.mark.parametrize(
-    ("env_id", "entry"),
-    [
-        (CART, {}),
-        (LAKE, {"normalize": {"norm_obs": False}}),
-        # Twenty-two thousand states of as many numbers each are two gigabytes.
-        ("RandomWarehouse-v0", {"env_kwargs": {"size": 150, "observation": "one_hot"}}),
-    ],
-)
-def test_where_episodes_must_be_sampled(env_id, entry):
-    assert known(env_id, entry) is None
+def test_where_episodes_must_be_sampled():
+    assert known(CART) is known(LAKE, {"normalize": {"norm_obs": False}}) is None
+    # Twenty-two thousand states of as many numbers each are two gigabytes.
+    large = {"env_kwargs": {"size": 150, "observation": "one_hot"}}
+    assert known("RandomWarehouse-v0", large) is None
 
 
 def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
@@ -286,17 +280,13 @@ def test_agents_without_memory_are_measured_by_the_best_of_their_kind():
     assert yardstick.baseline == pytest.approx(-12)
 
 
-@pytest.mark.parametrize(
-    ("env_id", "entry"),
-    [
-        (LAKE, {}),
-        (WAREHOUSE, {"env_kwargs": {"observation": "position"}}),
-        (CORRIDOR, {"env_kwargs": {"max_episode_steps": 1}}),
-    ],
-)
-def test_where_nothing_is_lost_by_observing_the_scale_stays(env_id, entry):
-    evaluator = known(env_id, entry)
-    assert evaluator.scale is evaluator.yardstick.hidden is None
+def test_where_nothing_is_lost_by_observing_the_scale_stays():
+    for env_id, kwargs in (
+        *((LAKE, {}), (WAREHOUSE, {"observation": "position"})),
+        (CORRIDOR, {"max_episode_steps": 1}),
+    ):
+        evaluator = known(env_id, {"env_kwargs": kwargs})
+        assert evaluator.scale is evaluator.yardstick.hidden is None
 
 
 class Counting:

@@ -232,8 +232,7 @@ def test_a_process_that_is_killed(tmp_path, typed):
     assert run.recorded()["state"] == "running"
     assert typed("train.py", "--resume", run.path, "--verbose", "0")[0] == 0
     whole = Run(tmp_path / "whole" / run.path.relative_to(tmp_path / "parts"))
-    names = ["CartPole-v1.zip", "best_model.zip", "evaluations.npz", "0.monitor.csv"]
-    for each in names:
+    for each in ("CartPole-v1.zip", "best_model.zip", "evaluations.npz", "0.monitor.csv"):
         assert content(run.path / each) == content(whole.path / each), each
     assert run.recorded()["final"] == whole.recorded()["final"]
 

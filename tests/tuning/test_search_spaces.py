@@ -84,12 +84,10 @@ def test_an_agent_takes_every_end_and_every_choice(algo):
     env.close()
 
 
-def suggestions_for(algo, env_id="FrozenLake-v1", **settings):
-    agents = (AgentSpec("shipped", algo, settings),)
-    environments = (EnvironmentSpec(env_id, env_id),)
-    tuning = TuningSpec(StudySpec("s", "S", agents, environments))
-    entry = {**as_run(algo, env_id), **settings}
-    return Suggestions(tuning, read_search_space(algo, env_id), entry)
+def tuning_of(algo, settings=(), **fields):
+    agents = (AgentSpec("shipped", algo, dict(settings)),)
+    places = (EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1"),)
+    return TuningSpec(StudySpec("s", "S", agents, places), **fields)
 
 
 BATCHES = [
@@ -103,8 +101,9 @@ BATCHES = [
 
 @pytest.mark.parametrize(("fixed", "drawn", "tried"), BATCHES)
 def test_batches_divide_the_buffer_of_steps(fixed, drawn, tried):
-    suggestions = suggestions_for("ppo", **{"n_envs": 8, **fixed})
-    entry = suggestions.merged(drawn)
+    settings, space = {"n_envs": 8, **fixed}, read_search_space("ppo", "FrozenLake-v1")
+    shipped = {**as_run("ppo", "FrozenLake-v1"), **settings}
+    entry = Suggestions(tuning_of("ppo", settings), space, shipped).merged(drawn)
     assert {key: entry[key] for key in tried} == tried
 
 
@@ -188,12 +187,10 @@ def test_settings_outside_widen_the_space(space):
 
 @pytest.mark.parametrize(("text", "message"), MISTAKES)
 def test_a_mistake_is_one_line_that_says_where(tmp_path, text, message):
-    place = EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1")
-    study = StudySpec("s", "S", (AgentSpec("shipped", "dqn"),), (place,))
     path = tmp_path / "space.yml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(UserError) as error:
-        open_search(TuningSpec(study, search_space=path), tmp_path)
+        open_search(tuning_of("dqn", search_space=path), tmp_path)
     assert message in str(error.value)
     assert "space.yml" in str(error.value)
     assert "\n" not in str(error.value)
