@@ -85,39 +85,18 @@ def test_which_arguments_reach_training_and_which_evaluation(tmp_path):
     assert all(isinstance(env, Monitor) for env in evaluation.envs)
 
 
-SHAPED = {"shelf_reward": -10}
-SCALED = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.01}}
-UNLIMITED = {"max_episode_steps": -1}
-
-
-@pytest.mark.parametrize(
-    ("entry", "changes"),
-    [
-        ({"train_env_kwargs": SHAPED}, ("shelf_reward -10",)),
-        ({"eval_env_kwargs": SHAPED}, ("shelf_reward -100",)),  # training is as usual
-        ({"train_env_kwargs": SHAPED, "eval_env_kwargs": SHAPED}, ()),
-        ({"env_kwargs": SHAPED, "train_env_kwargs": {"shelf_reward": -1}}, ("shelf_reward -1",)),
-        ({"train_env_kwargs": UNLIMITED}, ("no time limit",)),
-        ({"env_kwargs": UNLIMITED, "train_env_kwargs": {"max_episode_steps": None}}, ()),
-        ({"eval_env_kwargs": {"max_episode_steps": 9}}, ()),
-        ({"train_env_kwargs": {"random_start": True}}, ("random starts",)),
-        ({"train_env_wrapper": SCALED}, ("rewards x 0.01",)),
-        # In evaluations, too.
-        ({"env_wrapper": SCALED, "normalize": {"norm_reward": True}}, ()),
-        # What is usual may be said or left out.
-        ({"train_env_kwargs": {"slip": 0.0, "max_episode_steps": 1000}}, ()),
-    ],
-)
+@pytest.mark.parametrize(("entry", "changes"), TABLES["changes"])
 def test_what_training_changes(entry, changes):
-    assert training_changes(world("Warehouse-v0", entry)) == changes
+    assert [*training_changes(world("Warehouse-v0", entry))] == changes
 
 
 def test_evaluation_always_has_a_time_limit():
     """Where one is taken away, training may go on without end."""
+    unlimited = {"max_episode_steps": -1}
     for env_id, entry, limit in (
         ("CliffWalking-v1", {}, EVALUATION_TIME_LIMIT),
-        ("CartPole-v1", {"train_env_kwargs": UNLIMITED}, 500),
-        ("CartPole-v1", {"env_kwargs": UNLIMITED}, EVALUATION_TIME_LIMIT),
+        (CART, {"train_env_kwargs": unlimited}, 500),
+        (CART, {"env_kwargs": unlimited}, EVALUATION_TIME_LIMIT),
     ):
         spec = world(env_id, entry)
         made = make_single_env(spec, training=True), make_training_env(spec, None).envs[0]
