@@ -171,8 +171,8 @@ def test_what_a_policy_is_judged_on(name, value, refusal):
         evaluate_policy(**given, predicted=model)
 
 
-HEAD = "segment,arm,reward,propensity\n"
-NUMBERS = HEAD + "".join(f"{i % 2},{i % 3 % 2},{i % 5},0.5\n" for i in range(60))
+NUMBERS = "".join(f"{i % 2},{i % 3 % 2},{i % 5},0.5\n" for i in range(60))
+NUMBERS = f"segment,arm,reward,propensity\n{NUMBERS}"
 WORDS = NUMBERS.replace("\n0,", "\ncasual,").replace("\n1,", "\ncore,")
 
 

@@ -2,7 +2,6 @@
 
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +101,6 @@ def test_a_row_for_each_run(tmp_path):
     assert {name: row[name] for name in expected} == expected
 
 
-CORRIDOR = EnvironmentSpec("ShortCorridor-v0", "ShortCorridor-v0")
 BY_OBSERVATION = {
     "mean_return": -12.5, "optimum": -11.5, "baseline": -12.0, "gap": 1.0, "score": -1.0,
     "exact": True, "full_optimum": -3.0, "memory_optimum": -3.0, "memory_optimum_at_least": -3.0,
@@ -111,8 +109,8 @@ BY_OBSERVATION = {
 
 
 def test_where_an_agent_remembers_all_have_its_scale(tmp_path):
-    agents = ("qlearning", "ppo_lstm")
-    study = replace(study_of(n_seeds=1, agents=agents), environments=(CORRIDOR,))
+    places = [EnvironmentSpec("ShortCorridor-v0", "ShortCorridor-v0")]
+    study = study_of(n_seeds=1, agents=("qlearning", "ppo_lstm"), environments=places)
     planned = plan(study, tmp_path)
     for run in planned:
         own = {"optimum": -3.0, "measured_by": "memory", "gap": 9.5, "score": -0.5 / 9}

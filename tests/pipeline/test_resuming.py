@@ -204,7 +204,7 @@ def test_who_looks_on_leaves_the_same_agent(
 
 
 KILLED = """
-import os, signal
+import os, signal, sys
 from rl_yardstick.commands import run_command
 from rl_yardstick.pipeline.callbacks import StateCallback
 StateCallback.share_of_time, StateCallback.shortest_pause = 1e9, 0.0
@@ -214,7 +214,6 @@ def new(self):
     if self.model.num_timesteps > 500:
         os.kill(os.getpid(), signal.SIGKILL)
 StateCallback._on_rollout_start = new
-import sys
 sys.argv = ["train.py", *{words!r}]
 run_command("train")
 """

@@ -49,6 +49,9 @@ def test_numbers_are_given_once_and_the_newest_is_last():
     found = numbered_runs(Path("logs/qlearning"), "FrozenLake-v1")
     assert [number for number, _ in found] == list(range(1, 13))
     assert [path for _, path in found] == paths
+    # Each is held by one command at a time.
+    with pytest.raises(UserError, match="use by another command, process unknown"), Run(paths[0]):
+        Run(paths[0]).__enter__()
 
 
 @pytest.mark.parametrize(("is_new", "has_begun", "stays"), [(1, 0, 0), (1, 1, 1), (0, 0, 1)])

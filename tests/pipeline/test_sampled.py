@@ -89,16 +89,11 @@ class Steady(gym.Env):
         return 0, self.worth * ends, ends, False, {}
 
 
-@pytest.fixture
-def steady(monkeypatch):
+def steady(monkeypatch, returns, length, n_timesteps):
     """The spec of a run on episodes of one length."""
     monkeypatch.setitem(gym.registry, "Steady-v0", EnvSpec("Steady-v0", Steady))
-
-    def make(returns, length, **fields):
-        entry = {"env_kwargs": {"returns": returns, "length": length}}
-        return spec_of("random", "Steady-v0", entry, n_eval_envs=1, **fields)
-
-    return make
+    entry = {"env_kwargs": {"returns": returns, "length": length}, "n_timesteps": n_timesteps}
+    return spec_of("random", "Steady-v0", entry, n_eval_envs=1)
 
 
 # Of so few steps of training, 2,000 steps of evaluation are allowed.
@@ -111,19 +106,18 @@ def steady(monkeypatch):
         ([0.0, 9.0], 900, 5),  # five there are in any case
     ],
 )
-def test_the_last_evaluation_ends_when_it_is_sure_or_dear(steady, returns, length, n_episodes):
-    spec = steady(returns, length, n_timesteps=3000)
+def test_the_last_evaluation_ends_when_it_is_sure_or_dear(monkeypatch, returns, length, n_episodes):
+    spec = steady(monkeypatch, returns, length, 3000)
     evaluator = SampledEvaluator(spec, make_evaluation_env(spec, 1))
     found = evaluator.at_the_end(agent_of("random", make_training_env(spec, None)))
     assert len(found.returns) == n_episodes
     assert evaluator.n_steps == n_episodes * length
 
 
-def test_evaluations_are_left_out_while_they_are_too_dear(steady, tmp_path, monkeypatch):
+def test_evaluations_are_left_out_while_they_are_too_dear(tmp_path, monkeypatch):
     """Five episodes are 75 steps, and half of 300 are allowed over the whole training."""
     monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 0)  # in so short a training
-    spec = steady([1.0, 5.0], 15, n_timesteps=1500)
-    run, _ = run_of(spec, tmp_path)
+    run, _ = run_of(steady(monkeypatch, [1.0, 5.0], 15, 1500), tmp_path)
     with np.load(run.path / "evaluations.npz") as evaluations:
         assert evaluations["timesteps"].tolist() == [750, 1500]
         assert evaluations["results"].shape == (2, 5)
@@ -152,10 +146,6 @@ IN_BINS = partial(DiscretizeObservation, bins=[1, 6, 12, 6], **WIDTHS)
 SMALL = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [16]}}
 
 
-def environments(env_id, wrapper=None, n=5):
-    return make_vec_env(env_id, n, wrapper_class=wrapper)
-
-
 @pytest.mark.parametrize(
     ("algo", "env_id", "wrapper", "settings"),
     [
@@ -166,12 +156,12 @@ def environments(env_id, wrapper=None, n=5):
 )
 def test_compiled_play_is_the_same_to_the_bit(monkeypatch, algo, env_id, wrapper, settings):
     """Of tables, tiles and networks with numbers of all kinds."""
-    model = load_algorithm(algo)(env=environments(env_id, wrapper, 1), seed=1, **settings)
+    env, ours, plain = (make_vec_env(env_id, n, wrapper_class=wrapper) for n in (1, 5, 5))
+    model = load_algorithm(algo)(env=env, seed=1, **settings)
     generator = th.Generator().manual_seed(0)
     for numbers in model.policy.state_dict().values():
         if numbers.is_floating_point():
             numbers.add_(th.randn(numbers.shape, generator=generator, dtype=numbers.dtype))
-    ours, plain = environments(env_id, wrapper), environments(env_id, wrapper)
     copy = compiled_copy(ours)
     # More than one go, and further episodes that go on from where the generators were left.
     for i, play in enumerate([(5, 1), (23, None), (2, None), (5, 0)]):
