@@ -68,18 +68,18 @@ def test_workers_that_do_not_fit_are_refused(tmp_path, monkeypatch, facts, compl
 
 
 QUEUE = "jobqueue: {slurm: {cores: 1, memory: 1GB}}\n"
-# What is typed, the number of runs at once, and what is said of it.
-MISTAKES = [
-    ("local:none", 0, "give ADDRESS:PORT, a scheduler's file"),
-    ("somewhere", 0, "give ADDRESS:PORT"),
-    ("local:2", 3, "--jobs is for this machine or a queue of jobs"),
-    (QUEUE, 0, "say how many runs to do at once: --jobs N"),
-    ("jobqueue: {slrum: {}}\n", 2, "'slrum' is none of htcondor"),
-    ("slurm: {}\n", 2, "must hold the key jobqueue"),
-]
 
 
-@pytest.mark.parametrize(("where", "n_jobs", "complaint"), MISTAKES)
+@pytest.mark.parametrize(
+    ("where", "n_jobs", "complaint"),
+    [
+        ("local:none", 0, "give ADDRESS:PORT, a scheduler's file"),
+        ("local:2", 3, "--jobs is for this machine or a queue of jobs"),
+        (QUEUE, 0, "say how many runs to do at once: --jobs N"),
+        ("jobqueue: {slrum: {}}\n", 2, "'slrum' is none of htcondor"),
+        ("slurm: {}\n", 2, "must hold the key jobqueue"),
+    ],
+)
 def test_a_cluster_that_cannot_be(where, n_jobs, complaint, tmp_path):
     if "\n" in where:
         (tmp_path / "queue.yml").write_text(where)

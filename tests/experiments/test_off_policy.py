@@ -149,31 +149,30 @@ def test_estimates_hit_the_truth_and_intervals_cover_it_as_often_as_they_say():
 
 TOO_LITTLE = "the log holds too little of what the policy does: its weights are 0.979"
 TOO_SMALL = "the propensities are too small: the weights are 1.29 on average"
-# What stands where in a log of both arms in turn, and what is said of it.
+# What stands in a column of a log of both arms in turn, and what is said of it.
 LOGS = [
-    ("arms", slice(None), 0, r"arm 1 was never logged, and the policy chooses it for 50\.0%"),
+    ("arms", 0, r"arm 1 was never logged, and the policy chooses it for 50\.0%"),
     # Equal weights below 1 have no spread: what files round remains, 0.02.
-    ("propensities", slice(None), 0.5 / 0.981, None),
-    ("propensities", slice(None), 0.5 / 0.979, TOO_LITTLE),
+    ("propensities", 0.5 / 0.981, None),
+    ("propensities", 0.5 / 0.979, TOO_LITTLE),
     # Above 1 by x, the variance for a mean of 1 is x: x = 5 sqrt(x / n) + 0.02.
-    ("propensities", slice(None), 0.5 / 1.288, None),
-    ("propensities", slice(None), 0.5 / 1.289, TOO_SMALL),
+    ("propensities", 0.5 / 1.288, None),
+    ("propensities", 0.5 / 1.289, TOO_SMALL),
 ]
 
 
-@pytest.mark.parametrize(("name", "place", "value", "refusal"), LOGS)
-def test_what_a_policy_is_judged_on(name, place, value, refusal):
+@pytest.mark.parametrize(("name", "value", "refusal"), LOGS)
+def test_what_a_policy_is_judged_on(name, value, refusal):
     arms, rewards = np.arange(100) % 2, np.zeros(100)
     model = cross_fit(np.zeros(100, np.int64), arms, rewards, 2)
-    given = {"policy": np.full((100, 2), 0.5), "arms": arms.copy(), "rewards": rewards.copy()}
-    given["propensities"] = np.full(100, 0.5)
-    given[name][place] = value
+    given = {"policy": np.full((100, 2), 0.5), "arms": arms, "rewards": rewards}
+    given |= {"propensities": np.full(100, 0.5), name: np.full(100, value)}
     with pytest.raises(ValueError, match=refusal) if refusal else nullcontext():
         evaluate_policy(**given, predicted=model)
 
 
-HEAD = "segment,arm,reward,propensity\n"
-NUMBERS = HEAD + "".join(f"{i % 2},{i % 3 % 2},{i % 5},0.5\n" for i in range(60))
+NUMBERS = "".join(f"{i % 2},{i % 3 % 2},{i % 5},0.5\n" for i in range(60))
+NUMBERS = f"segment,arm,reward,propensity\n{NUMBERS}"
 WORDS = NUMBERS.replace("\n0,", "\ncasual,").replace("\n1,", "\ncore,")
 
 

@@ -97,6 +97,9 @@ def test_what_an_earlier_attempt_left_is_resumed_or_removed(tmp_path):
     agents = (AgentSpec("sarsa", "sarsa", {"engine": "interpreted"}),)
     study = StudySpec("s", "S", agents, (place,), 1)
     (whole,), (run,) = (plan(study, tmp_path / name) for name in ("whole", "cut"))
+    whole.path.mkdir(parents=True)
+    with Run(whole.path), pytest.raises(UserError, match="in use by another command"):
+        do_run(whole)
     do_run(whole)
     stop = Stop()
     stop.number = signal.SIGTERM
@@ -123,14 +126,6 @@ def test_what_an_earlier_attempt_left_is_resumed_or_removed(tmp_path):
         do_run(run)
         assert run.is_finished
         assert not (run.path / "of-an-earlier-attempt").exists()
-
-
-def test_two_processes_do_not_do_one_run(tmp_path):
-    place = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 300})
-    (run,) = plan(StudySpec("s", "S", (AgentSpec("sarsa", "sarsa"),), (place,), 1), tmp_path)
-    run.path.mkdir(parents=True)
-    with Run(run.path), pytest.raises(UserError, match="in use by another command"):
-        do_run(run)
 
 
 def test_a_function_is_called_in_another_process():

@@ -27,9 +27,11 @@ from rl_yardstick.experiments.study import (
 )
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.run import FAILED, FINISHED
+from rl_yardstick.pipeline.settings import read_yaml
 from rl_yardstick.report.words import seed_sentence
 
 SHIPPED = Path(studies.__file__).parents[1] / "studies"
+MISTAKES = read_yaml(Path(__file__).with_name("wrong_studies.yml"))
 
 
 @pytest.fixture
@@ -40,29 +42,6 @@ def read(tmp_path):
         return read_study(path)
 
     return read_text
-
-
-BASE = "agents: [qlearning]\nenvironments: [FrozenLake-v1]\n"
-TAXI = "environments: [Taxi-v4]\n"
-
-# The text, and what is said of it.
-MISTAKES = [
-    ("", "a study must map names to values"),
-    (BASE + "seed: 3\n", "unknown key 'seed': did you mean 'seeds'?"),
-    (BASE + "\nseeds: many\n", "seeds: count must be a valid integer, not 'many'"),
-    (BASE + "seeds: true\n", "seeds: count must be a number, not True"),
-    (BASE + "seeds:\n  first: -1\n", "seeds: first must be greater than or equal to 0, not -1"),
-    (BASE + "metric: finl\n", "did you mean 'final'?"),
-    (BASE + "run_timeout: -1\n", "run_timeout must be a time"),
-    (BASE + "quick:\n  budget: 0\n", "quick: budget must be greater than 0"),
-    (BASE + "quick:\n  sed: 0\n", "quick: unknown key 'sed': did you mean 'seeds'?"),
-    (BASE + "sweep:\n  gamma: []\n", "sweep: gamma must have at least 1 item"),
-    ("agents: [dqn]\n", "environments must list at least one name"),
-    (TAXI + "agents: [dqn, dqn]\n", "agents names one of them twice"),
-    (TAXI + "agents: [sarsa, qlerning]\n", "'qlerning': did you mean 'qlearning'?"),
-    (TAXI + "agents:\n  dqn:\n    conf_file: no.yml\n", "dqn: conf_file: there is no file "),
-    ("agents: [dqn]\nenvironments: {ice: {id: FrozenLak-v1}}\n", "mean 'FrozenLake-v1'"),
-]
 
 
 @pytest.mark.parametrize(("text", "complaint"), MISTAKES)
@@ -139,7 +118,7 @@ def test_an_agent_has_a_file_of_settings_beside_the_study(read, tmp_path):
 
 def test_sweeps_multiply(read):
     study = read(
-        TAXI + "sweep: {gamma: [0.9, 0.99], learning_rate: [0.1, 0.5]}\n"
+        "environments: [Taxi-v4]\nsweep: {gamma: [0.9, 0.99], learning_rate: [0.1, 0.5]}\n"
         "agents:\n  qlearning:\n  sarsa:\n    sweep: {gamma: [0.5]}\n"
     )
     assert [agent.label for agent in study.agents] == [
@@ -272,21 +251,19 @@ def test_a_run_is_finished_where_its_folder_says_so(tmp_path):
     assert not planned.is_finished
 
 
-OTHERS = {
-    "setting": study_of(AgentSpec("qlearning", "qlearning", {"gamma": 0.123})),
-    "budget": study_of("qlearning", environments=(replace(LAKE, settings={"n_timesteps": 101}),)),
-    "environment": study_of("qlearning", environments=(replace(LAKE, env_id="FrozenLake8x8-v1"),)),
-    "eval_freq": study_of("qlearning", eval_freq=50),
-}
+OTHERS = (
+    study_of(AgentSpec("qlearning", "qlearning", {"gamma": 0.123})),
+    study_of("qlearning", environments=(replace(LAKE, settings={"n_timesteps": 101}),)),
+    study_of("qlearning", environments=(replace(LAKE, env_id="FrozenLake8x8-v1"),)),
+    study_of("qlearning", eval_freq=50),
+)
 
 
 def test_a_run_of_other_settings_does_not_count(tmp_path):
     record(only(PLAIN, tmp_path))
     assert other_settings([only(PLAIN, tmp_path)]) == []
-    for study in OTHERS.values():
-        planned = only(study, tmp_path)
-        assert not planned.is_finished
-    ((_, differences),) = other_settings([only(OTHERS["setting"], tmp_path)])
+    assert not any(only(study, tmp_path).is_finished for study in OTHERS)
+    ((_, differences),) = other_settings([only(OTHERS[0], tmp_path)])
     assert differences["gamma"][1] == 0.123
 
 
@@ -318,14 +295,11 @@ SEEDS = [
 ]
 
 
-def tuned(agents, places=(TUNED,), first=0, count=10):
-    return tuning_seeds(study_of(*agents, environments=places, n_seeds=count, first_seed=first))
-
-
 @pytest.mark.parametrize(("agents", "places", "seeds", "sentence"), SEEDS)
 def test_what_is_said_of_the_seeds(agents, places, seeds, sentence):
     first, count = seeds
-    said = seed_sentence(range(first, first + count), tuned(agents, places, *seeds))
+    study = study_of(*agents, environments=places, n_seeds=count, first_seed=first)
+    said = seed_sentence(study.seeds, tuning_seeds(study))
     assert said.startswith(f"Seeds {first} to {first + count - 1}: ")
     assert sentence in said
     assert said.endswith(".")

@@ -1,13 +1,14 @@
-"""Specs, agents and short runs, as most of these tests want them."""
+"""Specs, agents and short runs, as most of these tests want them; tables of what is said."""
 
 from pathlib import Path
 
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.pipeline.run import Run
-from rl_yardstick.pipeline.settings import read_spec
+from rl_yardstick.pipeline.settings import read_spec, read_yaml
 from rl_yardstick.pipeline.training import train
 
 LAKE, CART, SWING, WAREHOUSE = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1", "Warehouse-v0"
+TABLES = read_yaml(Path(__file__).with_name("settings.yml"))
 
 
 def spec_of(algo, env_id=LAKE, entry=None, *, n_timesteps=1, seed=0, **fields):

@@ -33,7 +33,7 @@ from rl_yardstick.pipeline.environments import (
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.spec import Component
 from rl_yardstick.pipeline.training import make_agent
-from tests.pipeline.short_runs import CART, spec_of
+from tests.pipeline.short_runs import CART, TABLES, spec_of
 
 
 def world(env_id, entry=None):
@@ -85,39 +85,18 @@ def test_which_arguments_reach_training_and_which_evaluation(tmp_path):
     assert all(isinstance(env, Monitor) for env in evaluation.envs)
 
 
-SHAPED = {"shelf_reward": -10}
-SCALED = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.01}}
-UNLIMITED = {"max_episode_steps": -1}
-
-
-@pytest.mark.parametrize(
-    ("entry", "changes"),
-    [
-        ({"train_env_kwargs": SHAPED}, ("shelf_reward -10",)),
-        ({"eval_env_kwargs": SHAPED}, ("shelf_reward -100",)),  # training is as usual
-        ({"train_env_kwargs": SHAPED, "eval_env_kwargs": SHAPED}, ()),
-        ({"env_kwargs": SHAPED, "train_env_kwargs": {"shelf_reward": -1}}, ("shelf_reward -1",)),
-        ({"train_env_kwargs": UNLIMITED}, ("no time limit",)),
-        ({"env_kwargs": UNLIMITED, "train_env_kwargs": {"max_episode_steps": None}}, ()),
-        ({"eval_env_kwargs": {"max_episode_steps": 9}}, ()),
-        ({"train_env_kwargs": {"random_start": True}}, ("random starts",)),
-        ({"train_env_wrapper": SCALED}, ("rewards x 0.01",)),
-        # In evaluations, too.
-        ({"env_wrapper": SCALED, "normalize": {"norm_reward": True}}, ()),
-        # What is usual may be said or left out.
-        ({"train_env_kwargs": {"slip": 0.0, "max_episode_steps": 1000}}, ()),
-    ],
-)
+@pytest.mark.parametrize(("entry", "changes"), TABLES["changes"])
 def test_what_training_changes(entry, changes):
-    assert training_changes(world("Warehouse-v0", entry)) == changes
+    assert [*training_changes(world("Warehouse-v0", entry))] == changes
 
 
 def test_evaluation_always_has_a_time_limit():
     """Where one is taken away, training may go on without end."""
+    unlimited = {"max_episode_steps": -1}
     for env_id, entry, limit in (
         ("CliffWalking-v1", {}, EVALUATION_TIME_LIMIT),
-        ("CartPole-v1", {"train_env_kwargs": UNLIMITED}, 500),
-        ("CartPole-v1", {"env_kwargs": UNLIMITED}, EVALUATION_TIME_LIMIT),
+        (CART, {"train_env_kwargs": unlimited}, 500),
+        (CART, {"env_kwargs": unlimited}, EVALUATION_TIME_LIMIT),
     ):
         spec = world(env_id, entry)
         made = make_single_env(spec, training=True), make_training_env(spec, None).envs[0]
@@ -180,30 +159,16 @@ def test_a_maps_rows_take_the_place_of_its_path_and_a_log_is_found_from_other_fo
             assert with_files_read("Warehouse-v0", each) == read
         assert settings[key]["desc"] == "map.txt"
     assert with_files_read("FrozenLake-v1", settings) == settings
-    settings = {"env_kwargs": {"log": "pulls.csv"}, "eval_env_kwargs": {"log": "/a.csv"}}
-    found = with_files_read("ReplayBandit-v0", settings)
-    assert found == {**settings, "env_kwargs": {"log": str(tmp_path / "pulls.csv")}}
+    logs = {"env_kwargs": {"log": "pulls.csv"}, "eval_env_kwargs": {"log": "/a.csv"}}
+    found = with_files_read("ReplayBandit-v0", logs)
+    assert found == {**logs, "env_kwargs": {"log": str(tmp_path / "pulls.csv")}}
 
 
 KINDS = (nn.Module, optim.Optimizer, BaseBuffer)
 CALLBACKS = "stable_baselines3.common.callbacks"
 
-NAMES = [
-    ("nn.Tanh", "Tanh"),
-    ("torch.nn.modules.activation.ReLU", "ReLU"),
-    ("th.optim.Adam", "Adam"),
-    ("RMSpropTFLike", "RMSpropTFLike"),
-    ("nn.Tahn", "Tahn does not exist: did you mean 'Tanh'"),
-    ("nn.functional.relu", "is no Module or Optimizer or BaseBuffer"),
-    ("th.load", "is in none of the packages"),
-    ("os.system", "is in none of the packages"),
-    ("rl_zoo3.utils.get_class_by_name", "is in none of the packages"),
-    ("gymnasium.wrapers.TimeLimit", "No module named 'gymnasium.wrapers'"),
-    ("print", "is in none of the packages"),
-]
 
-
-@pytest.mark.parametrize(("name", "found"), NAMES)
+@pytest.mark.parametrize(("name", "found"), TABLES["names"])
 def test_which_names_are_classes(name, found):
     if found in name:
         assert find_class(name, KINDS, "here", []).__name__ == found
@@ -216,8 +181,6 @@ def test_which_names_are_classes(name, found):
 COMPONENTS = [
     (gym.Wrapper, "gymnasium.wrappers.TimeLimit", {}, "max_episode_steps"),
     (gym.Wrapper, "gymnasium.wrappers.TimeLimit", {"max_steps": 5}, "unknown argument 'max_steps'"),
-    (gym.Wrapper, "gymnasium.make", {}, "gymnasium.make is no Wrapper"),
-    (gym.Wrapper, "gymnasium.wrappers.TimeLimt", {}, "did you mean 'TimeLimit'"),
     (gym.Wrapper, "minigrid.wrappers.FlatObsWrapper", {}, "admit others with --gym-packages"),
     (BaseCallback, f"{CALLBACKS}.CheckpointCallback", {}, "save_freq"),
     (BaseCallback, f"{CALLBACKS}.BaseCallback", {}, "callback"),
@@ -273,22 +236,11 @@ def test_arguments_make_an_agent():
 
 MODULE = """
 import gymnasium as gym
-import numpy as np
-from {beside} import STEP
-
-class Own(gym.Env):
-    observation_space, action_space = gym.spaces.Discrete(2), gym.spaces.Discrete(2)
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return 0, {{}}
-    def step(self, action):
-        return STEP, 1.0, True, False, {{}}
+from {beside} import FACTOR
 
 class Twice(gym.RewardWrapper):
     def reward(self, reward):
-        return 2 * reward
-
-gym.register("{name}-v0", Own, max_episode_steps=5)
+        return FACTOR * reward
 """
 
 
@@ -298,8 +250,8 @@ def test_modules_that_were_typed(own_folder, monkeypatch, how):
     name, beside = f"mine_{how}", f"beside_{how}"
     folder = own_folder / ("there" if how == "file" else "")
     folder.mkdir(exist_ok=True)
-    (folder / f"{beside}.py").write_text("STEP = 1\n")
-    text = MODULE.format(name=name, beside=beside)
+    (folder / f"{beside}.py").write_text("FACTOR = 2\n")
+    text = MODULE.format(beside=beside)
     if how == "package":
         (own_folder / name).mkdir()
         (own_folder / name / "__init__.py").write_text(text)
@@ -308,8 +260,7 @@ def test_modules_that_were_typed(own_folder, monkeypatch, how):
     typed = f"there/{name}.py" if how == "file" else name
     import_modules([typed])
     assert module_name(typed) == name
-    wrapper = {f"{name}.Twice": {}}
-    spec = spec_of("qlearning", f"{name}-v0", {"env_wrapper": wrapper}, gym_packages=[typed])
+    spec = spec_of("random", CART, {"env_wrapper": f"{name}.Twice"}, gym_packages=[typed])
     env = make_training_env(spec, None)
     env.reset()
     assert env.step([0])[1].tolist() == [2.0]
@@ -319,11 +270,10 @@ def test_modules_that_were_typed(own_folder, monkeypatch, how):
 
 def test_modules_that_cannot_be_imported(own_folder, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
-    (own_folder / "failing.py").write_text("x = 1\nraise ValueError('no')\n")
-    (own_folder / "leaving.py").write_text("raise SystemExit(3)\n")
-    for typed, said in (
-        ("failing", r"failing\.py:2: no"),
-        ("leaving.py", r"leaving\.py:1: 3"),
+    for text, typed, said in (
+        ("x = 1\nraise ValueError('no')\n", "failing", r"failing\.py:2: no"),
+        ("raise SystemExit(3)\n", "leaving.py", r"leaving\.py:1: 3"),
     ):
+        (own_folder / typed).with_suffix(".py").write_text(text)
         with pytest.raises(UserError, match=said):
             import_modules([typed])

@@ -17,47 +17,46 @@ from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single, exact_ev
 from rl_yardstick.pipeline.evaluation.judge import by_histories, world_of_memory
 from rl_yardstick.pipeline.evaluation.sampled import evaluate
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
-from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of
-from tests.pipeline.short_runs import spec_of as spec_for
+from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, spec_of
 
-# Two-sided, of the normal distribution.
-WITHIN_999 = 3.2905
+WITHIN_999 = 3.2905  # two-sided, of the normal distribution
+UP, DOWN, LEFT, RIGHT = range(4)  # of the warehouse
 POSITION = {"env_kwargs": {"observation": "position", "max_episode_steps": 60, "slip": 0.1}}
 HOT = {"env_kwargs": {"slip": 0.1, "max_episode_steps": 60}}
 HOT |= {"env_wrapper": "rl_yardstick.envs.wrappers.OneHotObservation"}
 SLIPPERY = {"env_kwargs": {"slip": 0.1, "max_episode_steps": 60, "shelf_reward": -3}}
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "device": "cpu"}
 PROBS = {"probabilities": [0.2, 0.5, 0.9], "pulls": 100}
-BANDIT = {"env_kwargs": PROBS}
 AGENTS = {
     "qlearning": {"learning_rate": 0.5, "exploration_final_eps": 0.3, "engine": "interpreted"},
     "ppo": {**SMALL, "n_steps": 64, "batch_size": 64, "n_epochs": 2},
     "dqn": {**SMALL, "buffer_size": 500, "learning_starts": 50, "exploration_final_eps": 0.2},
 }
-N_STEPS = {"qlearning": 5000, "ppo": 256, "dqn": 300}
-ACT_BY = {"qlearning": "epsilon 0.3", "ppo": "its own distribution", "dqn": "epsilon 0.2"}
 
 
-def spec_of(env_id, entry=None):
-    return spec_for("qlearning", env_id, entry)
+def known(env_id, entry=None, algo="qlearning"):
+    """The exact evaluator of a run."""
+    return exact_evaluator(spec_of(algo, env_id, entry))
 
 
-def briefly_trained(name, spec):
-    return agent_of(name, make_training_env(spec, None), **AGENTS[name]).learn(N_STEPS[name])
+def learner(name, spec, n_steps):
+    return agent_of(name, make_training_env(spec, None), **AGENTS[name]).learn(n_steps)
 
 
 @pytest.mark.parametrize(
-    ("name", "env_id", "entry", "n_episodes"),
+    ("name", "n_steps", "entry", "n_episodes", "acts_by"),
     [
-        ("qlearning", WAREHOUSE, SLIPPERY, 200),
-        ("ppo", WAREHOUSE, HOT, 100),
-        ("dqn", WAREHOUSE, POSITION, 100),
+        ("qlearning", 5000, SLIPPERY, 200, "epsilon 0.3"),
+        ("ppo", 256, HOT, 100, "its own distribution"),
+        ("dqn", 300, POSITION, 100, "epsilon 0.2"),
     ],
 )
-def test_the_exact_return_is_that_of_the_agents_own_actions(name, env_id, entry, n_episodes):
+def test_the_exact_return_is_that_of_the_agents_own_actions(
+    name, n_steps, entry, n_episodes, acts_by
+):
     """The mean of sampled returns lies in its 99.9 % interval around the exact one."""
-    spec = spec_of(env_id, entry)
-    agent, evaluator = briefly_trained(name, spec), exact_evaluator(spec)
+    spec = spec_of("qlearning", WAREHOUSE, entry)
+    agent, evaluator = learner(name, spec, n_steps), exact_evaluator(spec)
     for deterministic in (True, False):
         exact = evaluator(agent, deterministic)
         policy = policy_matrix(agent, evaluator.observations, deterministic)
@@ -68,7 +67,7 @@ def test_the_exact_return_is_that_of_the_agents_own_actions(name, env_id, entry,
         assert played.mean_return == pytest.approx(exact.mean_return, abs=margin + 1e-4)
         assert played.lengths.mean() == pytest.approx(exact.lengths[0], rel=0.15)
     found = evaluator.other_returns(agent)
-    assert found.acts_by == ACT_BY[name]
+    assert found.acts_by == acts_by
     assert found.stochastic_return == pytest.approx(exact.mean_return)
     assert found.discount == 0.99
     assert found.discounted_return is not None
@@ -86,17 +85,11 @@ class Lookup:
         return self.actions[observation], None
 
 
-@pytest.mark.parametrize(
-    ("env_id", "entry"),
-    [
-        (CART, {}),
-        (LAKE, {"normalize": {"norm_obs": False}}),
-        # Twenty-two thousand states of as many numbers each are two gigabytes.
-        ("RandomWarehouse-v0", {"env_kwargs": {"size": 150, "observation": "one_hot"}}),
-    ],
-)
-def test_where_episodes_must_be_sampled(env_id, entry):
-    assert exact_evaluator(spec_of(env_id, entry)) is None
+def test_where_episodes_must_be_sampled():
+    assert known(CART) is known(LAKE, {"normalize": {"norm_obs": False}}) is None
+    # Twenty-two thousand states of as many numbers each are two gigabytes.
+    large = {"env_kwargs": {"size": 150, "observation": "one_hot"}}
+    assert known("RandomWarehouse-v0", large) is None
 
 
 def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
@@ -114,12 +107,9 @@ def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
     assert (policies.best_actions(Contrary(env="FrozenLake-v1"), states) == 3).all()
 
 
-DRY = {"env_kwargs": {"is_slippery": False}}
-
-
 def test_the_discounted_return_and_its_optimum_by_hand():
     """The shortest way over the lake that is not slippery has six steps."""
-    evaluator = exact_evaluator(spec_of(LAKE, DRY))
+    evaluator = known(LAKE, {"env_kwargs": {"is_slippery": False}})
     agent = load_algorithm("qlearning")(env=LAKE, gamma=0.9)
     best = value_iteration(evaluator.model, 0.9).policy
     agent.policy.q_tables[:] = th.eye(4, dtype=th.float64)[best]
@@ -135,7 +125,7 @@ def test_the_discounted_return_and_its_optimum_by_hand():
 def test_bandits_draw_their_arms_by_their_own_rule():
     scores = np.array([0.0, 0.5, 0.0])
     softmax = np.exp(scores) / np.exp(scores).sum()
-    evaluator = exact_evaluator(spec_for("epsilon_greedy", "BernoulliBandit-v0", BANDIT))
+    evaluator = known("BernoulliBandit-v0", {"env_kwargs": PROBS}, "epsilon_greedy")
     for name, arguments, words, chances in (
         ("epsilon_greedy", {"exploration_initial_eps": 0.3}, "epsilon 0.3", [0.1, 0.8, 0.1]),
         ("boltzmann", {"temperature": 1.0}, "temperature 1", softmax),
@@ -151,19 +141,15 @@ def test_bandits_draw_their_arms_by_their_own_rule():
 
 
 def test_the_best_policy_scores_1_and_the_baseline_one_0():
-    evaluator = exact_evaluator(spec_of(WAREHOUSE))
-    n_states, n_actions = evaluator.model.prob.shape[:2]
+    evaluator = known(WAREHOUSE)
     best = Lookup(value_iteration(evaluator.model, 1.0).policy)
     assert evaluator.yardstick.optimum == pytest.approx(79.0)
     assert evaluator(best).summary()["score"] == pytest.approx(1)
-    simple = [np.eye(n_actions)[[action] * n_states] for action in range(n_actions)]
-    simple.append(np.full((n_states, n_actions), 1 / n_actions))
-    horizon = evaluator.horizon
-    returns = [policy_return(evaluator.model, one, horizon).expected_return for one in simple]
-    assert max(map(evaluator.yardstick.score, returns)) == pytest.approx(0, abs=1e-12)
-    assert max(returns) == -1000
+    # The best constant policy goes left for ever, and stays where it is.
+    left = evaluator(Lookup(np.full(evaluator.model.n_states, LEFT)))
+    assert (left.mean_return, left.summary()["score"]) == (-1000, pytest.approx(0, abs=1e-12))
     # On the slippery lake the best policy depends on the time that is left.
-    assert exact_evaluator(spec_of(LAKE)).yardstick.optimum == pytest.approx(0.7442, abs=5e-5)
+    assert known(LAKE).yardstick.optimum == pytest.approx(0.7442, abs=5e-5)
 
 
 def test_figures_of_the_yardstick():
@@ -176,8 +162,8 @@ def test_figures_of_the_yardstick():
 
 
 def test_an_agent_that_has_learnt_something_else_is_evaluated_anew():
-    spec = spec_of(LAKE)
-    evaluator, agent = exact_evaluator(spec), briefly_trained("qlearning", spec)
+    spec = spec_of("qlearning", LAKE)
+    evaluator, agent = exact_evaluator(spec), learner("qlearning", spec, 5000)
     before, values = evaluator(agent), evaluator.values(evaluator.policy(agent, True))
     assert evaluator(agent) is before
     agent.policy.q_tables[:, 0] = -agent.policy.q_tables[:, 0] + th.arange(4)
@@ -188,10 +174,10 @@ def test_an_agent_that_has_learnt_something_else_is_evaluated_anew():
     assert evaluator.values(evaluator.policy(agent, True))[0] != values[0]
 
 
-def learner_on(desc, name="qlearning", **arguments):
-    """A run's evaluator, and an agent that has learned for a while."""
-    limited = {"max_episode_steps": 12, "is_slippery": False, "desc": desc}
-    spec = spec_of(LAKE, {"env_kwargs": limited})
+def on_a_small_lake(name, **arguments):
+    """An evaluator, and an agent that has learned for a while."""
+    limited = {"max_episode_steps": 12, "is_slippery": False, "desc": ["SF", "FG"]}
+    spec = spec_of("qlearning", LAKE, {"env_kwargs": limited})
     env = make_training_env(spec, None)
     agent = agent_of(name, env, engine="interpreted", **arguments).learn(400)
     return exact_evaluator(spec), agent
@@ -199,8 +185,7 @@ def learner_on(desc, name="qlearning", **arguments):
 
 def test_the_worth_of_exploring():
     """With as many states as actions, rows can be mistaken for columns."""
-    arguments = {"exploration": "boltzmann", "temperature": 0.3}
-    evaluator, agent = learner_on(["SF", "FG"], "sarsa", **arguments)
+    evaluator, agent = on_a_small_lake("sarsa", exploration="boltzmann", temperature=0.3)
     found = evaluator(agent, deterministic=False)
     chances = np.exp(agent.policy.q_table / 0.3)
     chances /= chances.sum(axis=1, keepdims=True)
@@ -215,7 +200,7 @@ def test_the_worth_of_exploring():
 
 
 def test_what_is_not_known_is_not_guessed():
-    evaluator, agent = learner_on(["SF", "FG"], exploration="gaussian_noise")
+    evaluator, agent = on_a_small_lake("qlearning", exploration="gaussian_noise")
     with pytest.raises(ValueError, match="no closed-form action probabilities"):
         evaluator(agent, deterministic=False)
     assert evaluator.other_returns(agent).stochastic_return is None
@@ -225,7 +210,6 @@ def test_what_is_not_known_is_not_guessed():
         policy_matrix(Lookup(np.zeros(16, int)), evaluator.observations, False)
 
 
-UP, DOWN, LEFT, RIGHT = range(4)  # of the warehouse
 LATE = "100% of its episodes run out of time"
 WELL = "the best"
 
@@ -234,26 +218,22 @@ def prefers(action):
     return [0.0 if i == action else -1.0 for i in range(4)]
 
 
+BETWEEN_TWO = {90: prefers(RIGHT), 91: prefers(LEFT)}
+INTO_THE_HOLE = {0: prefers(2), 1: prefers(1)}  # on the lake 1 is down and 2 is right
+
+
 @pytest.mark.parametrize(
     ("env_id", "rows", "instead"),
     [
         (WAREHOUSE, prefers(UP), f"{LATE}: it stays at row 8, column 1"),
-        (
-            WAREHOUSE,
-            {90: prefers(RIGHT), 91: prefers(LEFT)},
-            f"{LATE}: it circles between row 10, column 1; row 10, colu",
-        ),
-        (  # on the lake 1 is down and 2 is right
-            LAKE,
-            {0: prefers(2), 1: prefers(1)},
-            "100% of its episodes end before the time limit, 0.0% of all with",
-        ),
+        (WAREHOUSE, BETWEEN_TWO, f"{LATE}: it circles between row 10, column 1; row 10, colu"),
+        (LAKE, INTO_THE_HOLE, "100% of its episodes end before the time limit, 0.0% of all with"),
         ("Taxi-v4", [0, 0, 0, 0, 0, -1], f"{LATE}: it never leaves 60 of 400 states"),
         ("Taxi-v4", WELL, None),
     ],
 )
 def test_what_a_failed_agent_does_instead(env_id, rows, instead):
-    spec = spec_for(
+    spec = spec_of(
         "qlearning", env_id, {"env_kwargs": {"is_slippery": False} if env_id == LAKE else {}}
     )
     agent, evaluator = agent_of("qlearning", make_training_env(spec, None)), exact_evaluator(spec)
@@ -269,12 +249,8 @@ BEST_OF_CORRIDOR = -(6 + 4 * np.sqrt(2))
 SHORT = {"n_steps": 16, "batch_size": 16}
 
 
-def yardstick_of(algo, env_id, entry=None):
-    return exact_evaluator(spec_for(algo, env_id, entry)).yardstick
-
-
 def test_agents_without_memory_are_measured_by_the_best_of_their_kind():
-    yardstick = yardstick_of("qlearning", CORRIDOR)
+    yardstick = known(CORRIDOR).yardstick
     assert yardstick.optimum == pytest.approx(BEST_OF_CORRIDOR)
     assert yardstick.at_least is None
     figures = yardstick.figures(BEST_OF_CORRIDOR)
@@ -285,17 +261,13 @@ def test_agents_without_memory_are_measured_by_the_best_of_their_kind():
     assert yardstick.baseline == pytest.approx(-12)
 
 
-@pytest.mark.parametrize(
-    ("env_id", "entry"),
-    [
-        (LAKE, {}),
-        ("Warehouse-v0", {"env_kwargs": {"observation": "position"}}),
-        (CORRIDOR, {"env_kwargs": {"max_episode_steps": 1}}),
-    ],
-)
-def test_where_nothing_is_lost_by_observing_the_scale_stays(env_id, entry):
-    evaluator = exact_evaluator(spec_for("qlearning", env_id, entry))
-    assert evaluator.scale is evaluator.yardstick.hidden is None
+def test_where_nothing_is_lost_by_observing_the_scale_stays():
+    for env_id, kwargs in (
+        *((LAKE, {}), (WAREHOUSE, {"observation": "position"})),
+        (CORRIDOR, {"max_episode_steps": 1}),
+    ):
+        evaluator = known(env_id, {"env_kwargs": kwargs})
+        assert evaluator.scale is evaluator.yardstick.hidden is None
 
 
 class Counting:
@@ -312,7 +284,7 @@ class Counting:
 
 
 def worth(agent, env_id, **env_kwargs):
-    spec = spec_for("ppo_lstm", env_id, {"env_kwargs": env_kwargs} if env_kwargs else {})
+    spec = spec_of("ppo_lstm", env_id, {"env_kwargs": env_kwargs})
     return by_histories(spec, agent, evaluator_of_single(spec))
 
 
@@ -350,7 +322,7 @@ def test_histories_that_an_agent_does_not_tell_apart_are_one(monkeypatch):
 
 def test_all_histories_say_what_many_episodes_say():
     memory = {**SHORT, "policy_kwargs": {"lstm_hidden_size": 4}}
-    spec = spec_for("ppo_lstm", TIGER, {**memory, "env_kwargs": {"max_episode_steps": 5}})
+    spec = spec_of("ppo_lstm", TIGER, {**memory, "env_kwargs": {"max_episode_steps": 5}})
     env = make_evaluation_env(spec, 8)
     agent = agent_of("ppo_lstm", env, device="cpu", **memory).learn(32)
     exact = by_histories(spec, agent, world_of_memory(spec, agent))

@@ -1,7 +1,8 @@
-"""A training that is cut off and resumed ends in the bits of one that nobody disturbed."""
+"""A training that is watched, or cut off and resumed, ends in the bits of an undisturbed one."""
 
 import io
 import json
+import pickle
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from rl_yardstick.pipeline.callbacks import StateCallback
 from rl_yardstick.pipeline.errors import Stopped, UserError
 from rl_yardstick.pipeline.evaluation import sampled
-from rl_yardstick.pipeline.run import Run, resumable
+from rl_yardstick.pipeline.run import Run, read_diagnosis, resumable
 from rl_yardstick.pipeline.settings import override, read_entry, read_spec
 from rl_yardstick.pipeline.training import train
 from tests.pipeline.short_runs import CART, LAKE, SWING, run_of
@@ -108,6 +109,9 @@ def content(path):
         with zipfile.ZipFile(path) as members:
             tensors = {n: members.read(n) for n in members.namelist() if n.endswith(".pth")}
         return {name: bits(th.load(io.BytesIO(data))) for name, data in tensors.items()}
+    if "vecnormalize" in path.name:
+        held = pickle.loads(path.read_bytes())
+        return [each.tobytes() for each in (held.obs_rms.mean, held.ret_rms.var)]
     if path.suffix == ".npz":
         return {name: array.tobytes() for name, array in np.load(path).items()}
     if path.name.endswith("monitor.csv"):
@@ -163,15 +167,44 @@ def test_the_result_is_that_of_an_undisturbed_run(
         assert events(tmp_path) == events(tmp_path / "w")
 
 
-def test_a_run_that_is_cut_off_twice(monkeypatch):
-    spec = spec_of(LAKE, "qlearning", 600, {})
-    whole, _ = run_of(spec, "whole")
-    run = cut_off(spec, monkeypatch, 0.6, cut_off(spec, monkeypatch, 0.2))
-    assert_same(whole, resumed(run))
+SHORT = {**SMALL, "gae_lambda": 0.8}
+# What is noted by those who look on, and of what there are figures then.
+WATCHED = [
+    (CART, "ppo", {**SMALL, "normalize": True}, -1, {"eval_freq": 40}, "results"),
+    (LAKE, "qlearning", COMPILED, None, {"diagnose": True}, "overestimation"),
+    (LAKE, "ppo", {**SHORT, "engine": "library"}, 70, {"diagnose": True}, "gradient_cosine"),
+    (LAKE, "ppo", {**SHORT, **COMPILED}, 100, {"diagnose": True}, "gae_bias"),
+    (LAKE, "qlearning", {}, None, {"watch_learning": "page.html"}, "steps"),
+    (LAKE, "ppo", SMALL, None, {"watch_learning": "page.html"}, "moments"),
+]
+
+
+@pytest.mark.parametrize(("env_id", "algo", "settings", "eval_freq", "looks", "noted"), WATCHED)
+def test_who_looks_on_leaves_the_same_agent(
+    monkeypatch, env_id, algo, settings, eval_freq, looks, noted
+):
+    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 2000)
+    spec = spec_of(env_id, algo, 400, settings, eval_freq=eval_freq, eval_episodes=3)
+    alone, plain = run_of(spec, "alone")
+    run, outcome = run_of(spec.changed(**looks), "seen")
+    names = {str(path.relative_to(alone.path)) for path in alone.path.rglob("*.*")}
+    for name in names - {"run.json"}:
+        assert content(alone.path / name) == content(run.path / name), name
+    if noted == "results":
+        assert "evaluations.npz" not in names
+        found = np.load(run.path / "evaluations.npz")[noted]
+    elif "diagnose" in looks:
+        assert "diagnosis.csv" not in names
+        found = read_diagnosis((run.path / "diagnosis.csv").read_bytes())[noted][:4]
+        assert np.isfinite(found).all()
+    else:
+        assert outcome.engine == plain.engine
+        found = getattr(outcome.watch, noted)
+    assert len(found) >= 4
 
 
 KILLED = """
-import os, signal
+import os, signal, sys
 from rl_yardstick.commands import run_command
 from rl_yardstick.pipeline.callbacks import StateCallback
 StateCallback.share_of_time, StateCallback.shortest_pause = 1e9, 0.0
@@ -181,7 +214,6 @@ def new(self):
     if self.model.num_timesteps > 500:
         os.kill(os.getpid(), signal.SIGKILL)
 StateCallback._on_rollout_start = new
-import sys
 sys.argv = ["train.py", *{words!r}]
 run_command("train")
 """
@@ -199,39 +231,29 @@ def test_a_process_that_is_killed(tmp_path, typed):
     assert run.recorded()["state"] == "running"
     assert typed("train.py", "--resume", run.path, "--verbose", "0")[0] == 0
     whole = Run(tmp_path / "whole" / run.path.relative_to(tmp_path / "parts"))
-    names = ["CartPole-v1.zip", "best_model.zip", "evaluations.npz", "0.monitor.csv"]
-    for each in names:
+    for each in ("CartPole-v1.zip", "best_model.zip", "evaluations.npz", "0.monitor.csv"):
         assert content(run.path / each) == content(whole.path / each), each
     assert run.recorded()["final"] == whole.recorded()["final"]
 
 
-def test_without_a_state_the_run_begins_again(monkeypatch):
+def test_a_run_is_cut_off_twice_or_loses_its_state_and_a_state_of_others_is_refused(monkeypatch):
     spec = spec_of(LAKE, "qlearning", 600, {})
     whole, _ = run_of(spec, "whole")
+    twice = cut_off(spec, monkeypatch, 0.6, cut_off(spec, monkeypatch, 0.2))
+    assert_same(whole, resumed(twice))
     run = cut_off(spec, monkeypatch)
-    run.state_path.unlink()
-    assert_same(whole, resumed(run))
-
-
-def test_a_state_of_others_is_refused(monkeypatch):
-    run = cut_off(spec_of(LAKE, "qlearning", 600, {}), monkeypatch)
     state = run.state_path.read_bytes()
     for changed in (b"x" * 32 + state[32:], state[:-1], b""):
         run.state_path.write_bytes(changed)
         with pytest.raises(UserError, match="not signed with your key"):
             resumed(run)
-
-
-def test_what_cannot_be_resumed(monkeypatch):
-    spec = spec_of(LAKE, "qlearning", 600, {})
-    whole, _ = run_of(spec, "whole")
     with pytest.raises(UserError, match="is finished already"):
         resumable(whole.path)
-    run = cut_off(spec, monkeypatch)
     record = json.loads((run.path / "run.json").read_text())
     record["versions"]["torch"] = "1.0"
     (run.path / "run.json").write_text(json.dumps(record))
     with pytest.raises(UserError, match=r"was begun with torch 1\.0, here is "):
         resumable(run.path)
-    with pytest.raises(UserError, match="has no spec"):
-        resumable(run.path.parent)
+    # Without a state it begins again, in whatever versions.
+    run.state_path.unlink()
+    assert_same(whole, resumed(run))

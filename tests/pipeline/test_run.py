@@ -5,8 +5,6 @@ import math
 import os
 import resource
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,8 +30,7 @@ from rl_yardstick.pipeline.files import (
     write_json,
 )
 from rl_yardstick.pipeline.run import Run, Stop, numbered_runs
-from rl_yardstick.pipeline.training import train
-from tests.pipeline.short_runs import CART, LAKE, run_of, spec_of, trained
+from tests.pipeline.short_runs import CART, LAKE, TABLES, run_of, spec_of, trained
 
 
 @pytest.fixture(autouse=True)
@@ -51,20 +49,9 @@ def test_numbers_are_given_once_and_the_newest_is_last():
     found = numbered_runs(Path("logs/qlearning"), "FrozenLake-v1")
     assert [number for number, _ in found] == list(range(1, 13))
     assert [path for _, path in found] == paths
-
-
-def test_a_run_is_held_by_one_process_and_free_when_that_is_dead():
-    run = Run.claim(Path("logs"), spec_of("qlearning"))
-    run.begin(spec_of("qlearning"), {}, "train.py")
-    code = "import sys, time; from pathlib import Path; from rl_yardstick.pipeline.run import Run\n"
-    code += f"with Run(Path({str(run.path.absolute())!r})): print(1, flush=True); time.sleep(99)"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
-        assert other.stdout.readline() == b"1\n"
-        with pytest.raises(UserError, match="is in use by another command, process"), run:
-            pass
-        other.kill()
-    with run:
-        assert (run.path / "run.json").exists()
+    # Each is held by one command at a time.
+    with pytest.raises(UserError, match="use by another command, process unknown"), Run(paths[0]):
+        Run(paths[0]).__enter__()
 
 
 @pytest.mark.parametrize(("is_new", "has_begun", "stays"), [(1, 0, 0), (1, 1, 1), (0, 0, 1)])
@@ -119,10 +106,9 @@ def test_an_error_is_recorded_and_what_was_written_stays(monkeypatch):
 
     monkeypatch.setattr(EvaluationCallback, "evaluate", fail_at_the_third)
     spec = spec_of("qlearning", n_timesteps=1000, eval_freq=100)
-    run = Run.claim(Path("logs"), spec)
-    run.begin(spec, {}, "train.py")
-    with pytest.raises(OSError, match="No space"), run:
-        train(spec, run)
+    with pytest.raises(OSError, match="No space"):
+        run_of(spec)
+    run = Run(Path("logs/qlearning/FrozenLake-v1_1"))
     record = run.recorded()
     assert record["state"] == "failed"
     assert "No space left on device" in record["reason"]
@@ -210,9 +196,8 @@ class Sick(gym.Env):
 
     observation_space = spaces.Box(-1, 1, (2,), np.float32)
     action_space = spaces.Discrete(2)
-    fault = None
 
-    def __init__(self, fault="reward"):
+    def __init__(self, fault):
         self.fault, self.n_steps = fault, 0
 
     def reset(self, *, seed=None, options=None):
@@ -241,14 +226,12 @@ class Sick(gym.Env):
     ],
 )
 def test_what_an_environment_does_wrong(fault, kind, said, monkeypatch):
-    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
-    monkeypatch.setattr(gym, "registry", gym.envs.registration.registry)
-    gym.register("Sick-v0", Sick, max_episode_steps=50, kwargs={"fault": fault})
+    sick = EnvSpec("Sick-v0", Sick, max_episode_steps=50, kwargs={"fault": fault})
+    monkeypatch.setitem(gym.registry, "Sick-v0", sick)
     spec = spec_of("ppo", "Sick-v0", SMALL_PPO, n_timesteps=64, eval_freq=16, eval_episodes=1)
-    run = Run.claim(Path("logs"), spec)
-    run.begin(spec, {}, "train.py")
-    with pytest.raises(kind, match=said), run:
-        train(spec, run)
+    with pytest.raises(kind, match=said):
+        run_of(spec)
+    run = Run(Path("logs/ppo/Sick-v0_1"))
     record = run.recorded()
     assert record["state"] == "failed"
     assert said.split()[-1] in record["reason"]
@@ -262,30 +245,12 @@ def test_an_agent_that_learns_nonsense_is_not_saved():
     assert not list(Path("logs").rglob("CartPole-v1.zip"))
 
 
-@pytest.mark.parametrize(
-    ("algo", "entry", "said"),
-    [
-        ("ppo", {"n_episodes": 3, "learning_rate": "lin_0.1"}, "the schedules of ppo run by steps"),
-        ("ppo", {"policy": "CnnPolicy"}, "CnnPolicy"),
-        ("ppo", {"policy": "MlpPolcy"}, "unknown policy 'MlpPolcy': did you mean 'MlpPolicy'"),
-        ("ppo", {"policy_kwargs": {"net_arhc": [4]}}, "net_arhc"),
-        ("ppo", {"rollout_buffer_class": "HerReplayBuffer"}, "HerReplayBuffer"),
-        ("dqn", {"train_freq": [1, "day"]}, "day"),
-    ],
-)
+@pytest.mark.parametrize(("algo", "entry", "said"), TABLES["constructors"])
 def test_what_only_the_constructor_knows_is_one_line_and_leaves_no_folder(algo, entry, said):
     with pytest.raises(UserError) as caught:
         trained(algo, CART, entry, n_timesteps=64)
     assert said in str(caught.value)
     assert not Path("logs").exists()
-
-
-def test_pictures():
-    spec = spec_of("qlearning", LAKE, n_timesteps=2000, diagnose=True)
-    run, outcome = run_of(spec.changed(pictures=True))
-    assert outcome.can_be_explained
-    for name in ("learning_curve.png", "value_map.png"):
-        assert (run.path / name).stat().st_size > 5000
 
 
 def test_subprocesses_do_the_same():

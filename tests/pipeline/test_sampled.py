@@ -9,7 +9,6 @@ import pytest
 import torch as th
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
 
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.compiled import engine
@@ -25,9 +24,7 @@ from rl_yardstick.pipeline.evaluation.sampled import (
     evaluate_compiled,
     evaluation_seed,
 )
-from rl_yardstick.pipeline.settings import HYPERPARAMS, TUNED_ON, read_yaml
-from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of, trained
-from tests.pipeline.test_resuming import content
+from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of
 
 CAR = "MountainCar-v0"
 PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
@@ -37,9 +34,8 @@ def figures(evaluation):
     return evaluation.returns.tolist(), evaluation.lengths.tolist()
 
 
-def episodes(*returns, length=10, yardstick=None, successes=None):
-    lengths = np.full(len(returns), length)
-    return Evaluation(np.array(returns, float), lengths, successes, yardstick=yardstick)
+def episodes(*returns, yardstick):
+    return Evaluation(np.array(returns), np.full(len(returns), 10), None, yardstick=yardstick)
 
 
 def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile():
@@ -54,51 +50,22 @@ def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile():
     assert all(a != b for i, a in enumerate(different) for b in different[:i])
 
 
-def seeds_of_run(n_envs, seed, n_eval_envs=10):
-    """All seeds of environments, of action spaces and of the agent."""
-    starts = [evaluation_seed(seed, purpose) for purpose in PURPOSES]
-    evaluations = (range(start, start + n_eval_envs) for start in starts)
-    return {seed, *range(seed * n_envs, (seed + 1) * n_envs)}.union(*evaluations)
-
-
 def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_stream():
     starts = [[seed, *(evaluation_seed(seed, p) for p in PURPOSES)] for seed in range(500)]
     evaluations = [start for row in starts for start in row[1:]]
     assert all(0 <= seed < 2**31 for seed in evaluations)
     assert len(set(evaluations)) == len(evaluations)
     assert all(min(np.diff(sorted(row))) > 100 for row in starts)  # environments
-    # With every shipped entry, and with any two of them: runs of one study may be of several.
-    files = sorted(HYPERPARAMS.glob("*.yml"))
-    entries = [entry for path in files for key, entry in read_yaml(path).items() if key != TUNED_ON]
-    numbers = {entry.get("n_envs", 1) for entry in entries}
-    assert numbers == {1, 4, 8, 16, 32}
-    tuned, judged = (
-        set().union(*(seeds_of_run(n_envs, seed) for n_envs in numbers for seed in seeds))
-        for seeds in (range(10), range(1000, 1010))
-    )
-    assert not tuned & judged
 
+    def seeds_of_runs(seeds):
+        """Of agents and evaluations, and of environments of any two entries."""
+        begun = [
+            evaluation_seed(seed, p) + i for seed in seeds for p in PURPOSES for i in range(10)
+        ]
+        environments = (range(seeds.start * n, seeds.stop * n) for n in range(1, 33))
+        return {*seeds, *begun}.union(*environments)
 
-NORMALIZED = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 32, "batch_size": 32}
-NORMALIZED |= {"n_epochs": 2, "n_envs": 2, "normalize": True}
-
-
-def test_training_is_the_same_with_and_without_evaluations(tmp_path):
-    common = {"n_timesteps": 400, "folder": tmp_path, "eval_episodes": 3}
-    (often, found), (never, none) = (
-        trained("ppo", CART, NORMALIZED, eval_freq=n, **common) for n in (40, -1)
-    )
-    assert len(np.load(often.path / "evaluations.npz")["timesteps"]) >= 10
-    assert not (never.path / "evaluations.npz").exists()
-    assert (found.final is None, none.final is None) == (False, True)
-    for name in (f"{CART}.zip", "0.monitor.csv", "1.monitor.csv"):
-        assert content(often.path / name) == content(never.path / name), name
-    found, other = (
-        VecNormalize.load(str(each.path / CART / "vecnormalize.pkl"), make_vec_env(CART, 1))
-        for each in (often, never)
-    )
-    assert (found.obs_rms.mean == other.obs_rms.mean).all()
-    assert found.ret_rms.var == other.ret_rms.var
+    assert not seeds_of_runs(range(10)) & seeds_of_runs(range(1000, 1010))
 
 
 class Steady(gym.Env):
@@ -107,7 +74,7 @@ class Steady(gym.Env):
     observation_space = gym.spaces.Discrete(2)
     action_space = gym.spaces.Discrete(2)
 
-    def __init__(self, returns=(1.0,), length=1):
+    def __init__(self, returns, length):
         self.returns, self.length = itertools.cycle(returns), length
 
     def reset(self, *, seed=None, options=None):
@@ -121,16 +88,11 @@ class Steady(gym.Env):
         return 0, self.worth * ends, ends, False, {}
 
 
-@pytest.fixture
-def steady(monkeypatch):
+def steady(monkeypatch, returns, length, n_timesteps):
     """The spec of a run on episodes of one length."""
     monkeypatch.setitem(gym.registry, "Steady-v0", EnvSpec("Steady-v0", Steady))
-
-    def make(returns, length, **fields):
-        entry = {"env_kwargs": {"returns": returns, "length": length}}
-        return spec_of("random", "Steady-v0", entry, n_eval_envs=1, **fields)
-
-    return make
+    entry = {"env_kwargs": {"returns": returns, "length": length}, "n_timesteps": n_timesteps}
+    return spec_of("random", "Steady-v0", entry, n_eval_envs=1)
 
 
 # Of so few steps of training, 2,000 steps of evaluation are allowed.
@@ -143,19 +105,18 @@ def steady(monkeypatch):
         ([0.0, 9.0], 900, 5),  # five there are in any case
     ],
 )
-def test_the_last_evaluation_ends_when_it_is_sure_or_dear(steady, returns, length, n_episodes):
-    spec = steady(returns, length, n_timesteps=3000)
+def test_the_last_evaluation_ends_when_it_is_sure_or_dear(monkeypatch, returns, length, n_episodes):
+    spec = steady(monkeypatch, returns, length, 3000)
     evaluator = SampledEvaluator(spec, make_evaluation_env(spec, 1))
     found = evaluator.at_the_end(agent_of("random", make_training_env(spec, None)))
     assert len(found.returns) == n_episodes
     assert evaluator.n_steps == n_episodes * length
 
 
-def test_evaluations_are_left_out_while_they_are_too_dear(steady, tmp_path, monkeypatch):
+def test_evaluations_are_left_out_while_they_are_too_dear(tmp_path, monkeypatch):
     """Five episodes are 75 steps, and half of 300 are allowed over the whole training."""
     monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 0)  # in so short a training
-    spec = steady([1.0, 5.0], 15, n_timesteps=1500)
-    run, _ = run_of(spec, tmp_path)
+    run, _ = run_of(steady(monkeypatch, [1.0, 5.0], 15, 1500), tmp_path)
     with np.load(run.path / "evaluations.npz") as evaluations:
         assert evaluations["timesteps"].tolist() == [750, 1500]
         assert evaluations["results"].shape == (2, 5)
@@ -184,10 +145,6 @@ IN_BINS = partial(DiscretizeObservation, bins=[1, 6, 12, 6], **WIDTHS)
 SMALL = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [16]}}
 
 
-def environments(env_id, wrapper=None, n=5):
-    return make_vec_env(env_id, n, wrapper_class=wrapper)
-
-
 @pytest.mark.parametrize(
     ("algo", "env_id", "wrapper", "settings"),
     [
@@ -198,12 +155,12 @@ def environments(env_id, wrapper=None, n=5):
 )
 def test_compiled_play_is_the_same_to_the_bit(monkeypatch, algo, env_id, wrapper, settings):
     """Of tables, tiles and networks with numbers of all kinds."""
-    model = load_algorithm(algo)(env=environments(env_id, wrapper, 1), seed=1, **settings)
+    env, ours, plain = (make_vec_env(env_id, n, wrapper_class=wrapper) for n in (1, 5, 5))
+    model = load_algorithm(algo)(env=env, seed=1, **settings)
     generator = th.Generator().manual_seed(0)
     for numbers in model.policy.state_dict().values():
         if numbers.is_floating_point():
             numbers.add_(th.randn(numbers.shape, generator=generator, dtype=numbers.dtype))
-    ours, plain = environments(env_id, wrapper), environments(env_id, wrapper)
     copy = engine.compiled_copy(ours)
     # More than one go, and further episodes that go on from where the generators were left.
     for i, play in enumerate([(5, 1), (23, None), (2, None), (5, 0)]):

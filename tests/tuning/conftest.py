@@ -54,7 +54,8 @@ class Toy:
         (folder / "entry.yml").write_text(f"FrozenLake-v1: {ENTRY}".replace("'", ""))
         patch.setattr(searching, "planned_runs", self._planned)
         patch.setattr(searching, "outcome_of", lambda _, run: self._outcome(run))
-        patch.setattr(searching, "open_storage", self._storage)
+        storage = lambda root: self.storages.setdefault(root, InMemoryStorage())  # noqa: E731
+        patch.setattr(searching, "open_storage", storage)
 
     def tuning(self, **changes):
         settings, path = changes.pop("settings", {}), self.folder / "entry.yml"
@@ -97,14 +98,9 @@ class Toy:
         finished = self.finished.setdefault(root, set())
         return [ToyRun(entry, s, f"{name_of(entry)}/{s}", finished) for s in tuning.seeds]
 
-    def _storage(self, root):
-        return self.storages.setdefault(root, InMemoryStorage())
-
     def _outcome(self, run):
-        value = self.score(run.entry, run.seed)
-        return RunOutcome(
-            value, 1.0, "score", self.steps(run.entry, run.seed) if value >= 1 else None
-        )
+        value, steps = self.score(run.entry, run.seed), self.steps(run.entry, run.seed)
+        return RunOutcome(value, 1.0, "score", steps if value >= 1 else None)
 
 
 def score(entry, seed):

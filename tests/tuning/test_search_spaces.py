@@ -1,6 +1,7 @@
 """Search spaces: read strictly, asked by Optuna, and back from settings."""
 
 from functools import cache
+from pathlib import Path
 
 import gymnasium as gym
 import optuna
@@ -21,26 +22,9 @@ from rl_yardstick.tuning.tuning_spec import TuningSpec
 
 FOLDER = settings.HYPERPARAMS / "search_spaces"
 NOTHING_TO_SEARCH = {"optimal", "random", "angle", "mabwiser_thompson"}
+DQN_SPACE = Path(__file__).with_name("dqn_space.yml")
+MISTAKES = read_yaml(DQN_SPACE.with_name("wrong_spaces.yml"))
 SEARCHED = [name for name in ALGORITHMS if name not in NOTHING_TO_SEARCH]
-
-DQN_SPACE = """
-default:
-  learning_rate: {low: 0.001, high: 0.1, scale: log, forms: [constant, linear, exponential]}
-  gamma: {low: 0.9, high: 0.999, scale: log_below_one, forms: [constant, 1.0]}
-  batch_size: {low: 32, high: 128, scale: powers_of_two}
-  n_steps: {low: 1, high: 5}
-  updates:
-    sets: {few: {train_freq: 16, gradient_steps: 1}, many: {train_freq: 4, gradient_steps: 8}}
-  max_grad_norm: [1, 10]
-  exploration_fraction: {low: 0.1, high: 0.9, when: {max_grad_norm: 10}}
-  policy_kwargs.net_arch: {choices: {small: [32], large: [64, 64]}}
-  train_env_wrapper:
-    choices: {plain: null, tenth: {rl_yardstick.envs.wrappers.ScaleReward: {scale: 0.1}}}
-Taxi-v4:
-  n_steps: null
-  max_grad_norm: [2, 20]
-  exploration_fraction: {low: 0.1, high: 0.2}
-"""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,14 +37,8 @@ def files_read_once():
 
 
 @pytest.fixture
-def space(tmp_path):
-    return read(tmp_path, DQN_SPACE)
-
-
-def read(tmp_path, text, env_id="Foo-v0", algo="dqn"):
-    path = tmp_path / "space.yml"
-    path.write_text(text, encoding="utf-8")
-    return read_search_space(algo, env_id, path)
+def space():
+    return read_search_space("dqn", "Foo-v0", DQN_SPACE)
 
 
 def shipped(algo):
@@ -106,12 +84,10 @@ def test_an_agent_takes_every_end_and_every_choice(algo):
     env.close()
 
 
-def suggestions_for(algo, env_id="FrozenLake-v1", **settings):
-    agents = (AgentSpec("shipped", algo, settings),)
-    environments = (EnvironmentSpec(env_id, env_id),)
-    tuning = TuningSpec(StudySpec("s", "S", agents, environments))
-    entry = {**as_run(algo, env_id), **settings}
-    return Suggestions(tuning, read_search_space(algo, env_id), entry)
+def tuning_of(algo, settings=(), **fields):
+    agents = (AgentSpec("shipped", algo, dict(settings)),)
+    places = (EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1"),)
+    return TuningSpec(StudySpec("s", "S", agents, places), **fields)
 
 
 BATCHES = [
@@ -125,8 +101,9 @@ BATCHES = [
 
 @pytest.mark.parametrize(("fixed", "drawn", "tried"), BATCHES)
 def test_batches_divide_the_buffer_of_steps(fixed, drawn, tried):
-    suggestions = suggestions_for("ppo", **{"n_envs": 8, **fixed})
-    entry = suggestions.merged(drawn)
+    settings, space = {"n_envs": 8, **fixed}, read_search_space("ppo", "FrozenLake-v1")
+    shipped = {**as_run("ppo", "FrozenLake-v1"), **settings}
+    entry = Suggestions(tuning_of("ppo", settings), space, shipped).merged(drawn)
     assert {key: entry[key] for key in tried} == tried
 
 
@@ -164,6 +141,9 @@ def test_what_does_not_exist_leaves_the_entry(space):
     assert "exploration_fraction" not in merged
     assert merged["policy_kwargs"] == {"net_arch": [32], "activation_fn": "nn.ReLU"}
     assert merged["n_timesteps"] == 10
+    # Nor does what an environment's entry takes out of the space.
+    other = read_search_space("dqn", "Taxi-v4", DQN_SPACE)
+    assert {*space.keys} - {*other.keys} == {"n_steps"}
 
 
 def test_every_setting_leads_back_to_itself(space):
@@ -205,34 +185,12 @@ def test_settings_outside_widen_the_space(space):
     assert wider.including(entry)[0] == wider
 
 
-MISTAKES = [
-    ("CartPole-v1: {gamma: [0.9, 1.0]}", "no entry for 'FrozenLake-v1', and no default"),
-    ("default: {gamma: {lo: 0.1, high: 1.0}}", "gamma: unknown key 'lo': did you mean 'low'"),
-    ("default: {gamma: {low: 0.9, scale: log}}", "gamma: high: field required"),
-    ("default: {gamma: {low: 0.9, high: 0.1}}", "low must be below high"),
-    ("default: {batch_size: {low: 30, high: 64, scale: powers_of_two}}", "powers of two"),
-    ("default: {gamma: [0, 1], u: {sets: {a: {gamma: 1}, b: {}}}}", "gamma and u both decide"),
-    ("default: {env_kwargs.slip: [0.0, 0.2]}", "env_kwargs.slip is what settings are judged on"),
-    ("default: {gamma: 0.9}", "gamma must be a list of values, or map low and high"),
-    ("default: {gamma: [0.9]}", "there must be two values at least"),
-    ("default: {policy_kwargs.net_arch: [[64], [32]]}", "[64] needs a name, as in choices"),
-    ("default: {gamma: [0.9, 0.8], tau: {low: 0.1, high: 1.0, when: {gama: 0.9}}}", "'gamma'"),
-    # What the agent does not take.
-    ("default: {lerning_rate: {low: 0.1, high: 1.0}}", "did you mean 'learning_rate'"),
-    ("default: {gamma: {low: 0.9, high: 1.5}}", "not 1.5: input should be less than or equal to 1"),
-    ("default: {batch_size: {low: 32, high: 64.0}}", "batch_size must be a whole number"),
-    ("default: {seed: [1, 2]}", "seed is set by --seed"),
-]
-
-
 @pytest.mark.parametrize(("text", "message"), MISTAKES)
 def test_a_mistake_is_one_line_that_says_where(tmp_path, text, message):
-    place = EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1")
-    study = StudySpec("s", "S", (AgentSpec("shipped", "dqn"),), (place,))
     path = tmp_path / "space.yml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(UserError) as error:
-        open_search(TuningSpec(study, search_space=path), tmp_path)
+        open_search(tuning_of("dqn", search_space=path), tmp_path)
     assert message in str(error.value)
     assert "space.yml" in str(error.value)
     assert "\n" not in str(error.value)

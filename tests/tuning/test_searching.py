@@ -3,22 +3,16 @@
 import math
 import statistics
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from optuna.trial import create_trial
 
 from rl_yardstick.experiments.analysis import analyse, looked
-from rl_yardstick.experiments.plan import plan
-from rl_yardstick.experiments.results import (
-    CURVE_COLUMNS,
-    RUN_COLUMNS,
-    RunResults,
-    StudyResults,
-)
+from rl_yardstick.experiments.results import RunResults
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.settings import read_entry, seeds_tuned_on
+from rl_yardstick.pipeline.settings import read_entry, read_yaml, seeds_tuned_on
 from rl_yardstick.tuning import retesting, searching
 from rl_yardstick.tuning.retesting import (
     Outcome,
@@ -43,8 +37,10 @@ from rl_yardstick.tuning.searching import (
     outcomes_of,
 )
 from rl_yardstick.verdicts import Estimate, steps_to_threshold
+from tests.experiments.test_growing import results_of
 
 REAL_OUTCOME_OF, REAL_STORAGE = outcome_of, open_storage
+HOPELESS = read_yaml(Path(__file__).with_name("hopeless.yml"))
 
 
 def states(search):
@@ -180,14 +176,6 @@ def test_values_of_a_setting_by_hand(toy, objective, figure, value):
     assert tuning.value([0.0, 1.0, 0.9, 0.8, 0.1]) == pytest.approx(value)
 
 
-def outcome(toy, monkeypatch, figure, **row):
-    row = {"seconds": 2.0, "n_timesteps": 30, "threshold": 0.5, **row}
-    row["steps_to_threshold"] = steps_to_threshold([10, 20, 30], [0.0, 0.6, 0.4], row["threshold"])
-    results = RunResults([row])
-    monkeypatch.setattr(searching, "read_run", lambda *_: results)
-    return REAL_OUTCOME_OF(toy.tuning(figure=figure), None)
-
-
 # The figure, what the run came to, the figure of it, and steps where it had the optimum.
 FIGURES_OF_RUNS = [
     ("score", {"score": 0.7, "final": 5.0}, 0.7, None),
@@ -204,7 +192,10 @@ FIGURES_OF_RUNS = [
 
 @pytest.mark.parametrize(("figure", "row", "value", "steps"), FIGURES_OF_RUNS)
 def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value, steps):
-    found = outcome(toy, monkeypatch, figure, **row)
+    row = {"seconds": 2.0, "n_timesteps": 30, "threshold": 0.5, **row}
+    row["steps_to_threshold"] = steps_to_threshold([10, 20, 30], [0.0, 0.6, 0.4], row["threshold"])
+    monkeypatch.setattr(searching, "read_run", lambda *_: RunResults([row]))
+    found = REAL_OUTCOME_OF(toy.tuning(figure=figure), None)
     assert (found.figure, found.seconds, found.steps) == (value, 2.0, steps)
 
 
@@ -221,44 +212,12 @@ def test_the_first_trial_and_the_best_one_go_on_and_the_worst_of_many_does_not()
     assert any(is_hopeless(scored([0.0] * n), better) for n in range(1, 12))
 
 
-TWO = [[0.9, 0.9, 1.0], [1.0, 0.2]]
-FAILED = [[0.9, 0.9, 0.9], [1.0, 0.1]]
-SHORT = [[0.9, 0.9]]
-# A score of 10 has been seen: with that, any trial could still win.
-NINE, TEN = ([[0.5] * n, [10.0]] for n in (9, 10))
-WORSE = [0.4, 0.39, 0.38, 0.37]
-
-
-@pytest.mark.parametrize(
-    ("scores", "others", "options", "hopeless"),
-    [
-        # What is left counts as perfect: 0.9 and twice 1.0 is more than 2.8, with 0.8 it is a draw.
-        ([0.8], TWO, {}, False),
-        ([1.0, 0.79], TWO, {}, True),
-        # A trial under way is no measure.
-        ([0.1], SHORT, {}, True),
-        ([0.1], SHORT, {"n_seeds": 3}, False),
-        # Perfect is the highest score that any trial has had.
-        ([-115.0], [[-110.0, -110.0], [-100.0, -200.0]], {}, False),
-        # Where the optimum is known nothing less is.
-        ([0.6], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, False),
-        ([0.05], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, True),
-        # One failed seed of three sinks a mean, and no median.
-        ([0.1], FAILED, {"value": statistics.median}, False),
-        ([0.1, 0.1], FAILED, {"value": statistics.median}, True),
-        # Ranks decide from ten seeds on.
-        (WORSE, NINE, {}, False),
-        (WORSE, TEN, {}, True),
-    ],
-)
+@pytest.mark.parametrize(("scores", "others", "options", "hopeless"), HOPELESS)
 def test_what_is_hopeless(scores, others, options, hopeless):
+    if "value" in options:
+        options = {"value": statistics.median}
     found = is_hopeless(scored(scores), [scored(each) for each in others], **options)
     assert found is hopeless
-
-
-def retested(number, held_out, verdict):
-    label = f"trial {number}" if number else "shipped"
-    return Retested(label, number, 0.9, held_out, Estimate(held_out, 0.5, 0.9, 20), verdict, 20, 0)
 
 
 @pytest.mark.parametrize(
@@ -342,34 +301,21 @@ ENTRY = {
 
 
 def runs_of_retest(toy, root, runs, **changes):
-    """A re-test whose runs ended so, by settings: its tuning, candidates, results and figures.
-
-    A run is its score, or the score and the searched figure; None if it is missing.
-    """
+    """A re-test whose runs came to such scores, by settings: its tuning, candidates and results."""
     tuning = toy.tuning(retest_seeds=len(runs["shipped"]), **changes)
     labels = [label for label in runs if label != "shipped"]
     found = [complete_trial(int(label[-1]), ENTRY, [0.5]) for label in labels]
     study = retest_study(tuning, root, found)
-    planned = plan(study, root)
-    ended = {(r.agent, r.seed): runs[r.agent][r.seed - 1000] for r in planned}
-    ends = {key: np.broadcast_to(end, 2) for key, end in ended.items() if end is not None}
-    rows = [
-        {"agent": agent, "environment": "FrozenLake-v1", "env_id": "FrozenLake-v1", "seed": seed}
-        | {"final": score, "score": score, "optimum": 1.0, "baseline": 0.0, "exact": True}
-        for (agent, seed), (score, _) in ends.items()
-    ]
-    tables = pd.DataFrame(rows, columns=RUN_COLUMNS), pd.DataFrame(columns=CURVE_COLUMNS)
-    return tuning, found, StudyResults(study, root, *tables, tuple(planned)), ends
+    ends = {label: [s if s is None else 100 * s for s in scores] for label, scores in runs.items()}
+    return tuning, found, results_of(study, root, ends)
 
 
-def re_tested(toy, root, monkeypatch, runs, **changes):
-    """The outcome of such a re-test."""
-    tuning, found, results, ends = runs_of_retest(toy, root, runs, **changes)
-    monkeypatch.setattr(
-        retesting,
-        "outcome_of",
-        lambda _, run: RunOutcome(float(ends[run.agent, run.seed][1]), 1.0, "score"),
-    )
+def re_tested(toy, root, monkeypatch, runs, figures=None, **changes):
+    """The outcome of such a re-test, where the searched figures may be others than scores."""
+    tuning, found, results = runs_of_retest(toy, root, runs, **changes)
+    told = figures or runs
+    outcome = lambda _, run: RunOutcome(told[run.agent][run.seed - 1000], 1.0, "score")  # noqa: E731
+    monkeypatch.setattr(retesting, "outcome_of", outcome)
     return concluded(tuning, found, found, analyse(results))
 
 
@@ -414,7 +360,7 @@ def test_a_re_test_has_grown_enough_when_its_best_setting_is_decided(
     toy, tmp_path, first, second, settled
 ):
     runs = {"shipped": OLD, "trial 1": first, "trial 2": second}
-    _, _, results, _ = runs_of_retest(toy, tmp_path, runs)
+    _, _, results = runs_of_retest(toy, tmp_path, runs)
     said = looked(results, (20, 40))
     words = {(pair.first, pair.second): pair.word for pair in said.pairs}
     expected = "undecided" if first == OLD else "worse"
@@ -428,15 +374,16 @@ def test_a_re_test_has_grown_enough_when_its_best_setting_is_decided(
         # Words are on means, also if another statistic was searched.
         ({"objective": "lower"}, SKEWED, [0.36] * 20, "undecided"),
         # Both reach the optimum, one of them sooner.
-        ({"figure": "steps"}, [(1.0, 900.0 + k) for k in range(20)], [(1.0, 500.0)] * 20, "better"),
-        ({"figure": "steps"}, [(1.0, 5.0)] * 20, [(1.0, 4.0)] * 6 + [(1.0, 9.0)] * 14, "worse"),
+        ({"figure": "steps"}, [900.0 + k for k in range(20)], [500.0] * 20, "better"),
+        ({"figure": "steps"}, [5.0] * 20, [4.0] * 6 + [9.0] * 14, "worse"),
     ],
 )
 def test_the_verdict_is_about_what_was_searched_for(
     toy, tmp_path, monkeypatch, changes, shipped, found, word
 ):
-    runs = {"shipped": shipped, "trial 1": found, "trial 2": shipped}
-    outcome = re_tested(toy, tmp_path, monkeypatch, runs, **changes)
+    figures = {"shipped": shipped, "trial 1": found, "trial 2": shipped}
+    runs = figures if "objective" in changes else dict.fromkeys(figures, [1.0] * 20)
+    outcome = re_tested(toy, tmp_path, monkeypatch, runs, figures, **changes)
     same = outcome.retested[2].verdict
     assert [each.verdict for each in outcome.retested[:2]] == ["", word]
     assert same in ("undecided", "tied so far")
@@ -455,9 +402,16 @@ def test_an_entry_is_read_as_it_was_with_the_seeds_that_it_has_seen(toy, tmp_pat
 
 
 def test_the_file_of_the_winner_says_where_it_comes_from(toy):
-    search, winner = toy.opened(), retested(4, 0.85, "better")
+    search = toy.opened()
     toy.search(search)
-    outcome = Outcome((retested(0, 0.7, ""), winner), winner, "", 0.05, range(1000, 1020))
+    shipped, winner = (
+        Retested(label, number, 0.9, held_out, Estimate(held_out, 0.5, 0.9, 20), verdict, 20, 0)
+        for label, number, held_out, verdict in (
+            ("shipped", 0, 0.7, ""),
+            ("trial 4", 4, 0.85, "better"),
+        )
+    )
+    outcome = Outcome((shipped, winner), winner, "", 0.05, range(1000, 1020))
     path = write_winner(search, outcome)
     assert read_entry("qlearning", "FrozenLake-v1", path) == search.trials[4].user_attrs[SETTINGS]
     said = " ".join(line[2:] for line in path.read_text().splitlines() if line.startswith("# "))
