@@ -7,7 +7,7 @@ agent.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -161,7 +161,8 @@ class PlanningAgent(OnlineAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ActionTablePolicy": ActionTablePolicy}
     policy: ActionTablePolicy
-    default_gamma: ClassVar[float]
+    default_gamma: ClassVar[float] = 0.99
+    planner: ClassVar[Callable[..., Any]]
     hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
 
     def __init__(
@@ -216,9 +217,9 @@ class PlanningAgent(OnlineAlgorithm):
             raise ValueError(f"{name} needs observations that tell the states apart")
         self.policy.set_actions(actions, horizon)
 
-    @abstractmethod
     def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
         """The plan under a time limit, among the actions of ``mask``, bool of shape (S, A)."""
+        return type(self).planner(model, self.gamma, mask=mask).policy[None], 1
 
     def _choose_actions(self) -> Ints:
         actions = self.policy.actions_after(np.asarray(self._last_obs), self._steps)
@@ -260,10 +261,7 @@ class ValueIteration(PlanningAgent):
     Without a discount, shorter and longer ways to the goal may have the same value.
     """
 
-    default_gamma = 0.99
-
-    def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
-        return value_iteration(model, self.gamma, mask=mask).policy[None], 1
+    planner = staticmethod(value_iteration)
 
 
 class PolicyIteration(PlanningAgent):
@@ -272,10 +270,7 @@ class PolicyIteration(PlanningAgent):
     It takes few rounds, each of which solves a linear system: for up to about 10,000 states.
     """
 
-    default_gamma = 0.99
-
-    def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
-        return policy_iteration(model, self.gamma, mask=mask).policy[None], 1
+    planner = staticmethod(policy_iteration)
 
 
 class Optimal(PlanningAgent):

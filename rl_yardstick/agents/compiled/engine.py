@@ -316,17 +316,12 @@ class Plan(NamedTuple):
     """A player with a fixed action for each observed number."""
 
     actions: Ints  # one for each number, shape (S,)
+    seen: Any  # how observations are read
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:
         """Look the action up."""
         env.action = self.actions[env.obs]
-
-    @inlined
-    def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Learn nothing; move on to the next observations."""
-        for i in range(len(envs)):
-            envs[i].obs = envs[i].new_obs
 
 
 def play_episodes(

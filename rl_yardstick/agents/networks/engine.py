@@ -18,7 +18,7 @@ from torch import nn
 from rl_yardstick.agents.common.callbacks import EpisodeBudget, Horizon, horizon, members
 from rl_yardstick.agents.common.exploration import first_best
 from rl_yardstick.agents.compiled.engine import CompiledEngine
-from rl_yardstick.agents.compiled.env_states import BEFORE, Numbers, look, move_on
+from rl_yardstick.agents.compiled.env_states import BEFORE, Numbers, look
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
 from rl_yardstick.agents.compiled.references import Reference, address_of, call, handles_of
 from rl_yardstick.agents.compiled.worlds import NotCompilable
@@ -467,12 +467,6 @@ class NetworkPlayer(NamedTuple):
         """Take the best action."""
         look(self.seen, env, BEFORE, self.network.single, self.network.layers.one_hot)
         env.action = call(self.choose, self.network, 0.0, 0.0)
-
-    @inlined
-    def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Learn nothing; move on to the next observations."""
-        for i in range(len(envs)):
-            move_on(self.seen, envs[i])
 
     def check(self) -> None:
         """Raise the exception of the library's `predict`, if there was one."""

@@ -19,16 +19,9 @@ from torch import nn
 
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.schedules import ScheduleRow, schedule_value
-from rl_yardstick.agents.compiled.env_states import (
-    AFTER,
-    BEFORE,
-    Numbers,
-    look,
-    move_on,
-    observe,
-    show,
-)
+from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, Numbers, look, observe, show
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
+from rl_yardstick.agents.compiled.loop import move_on
 from rl_yardstick.agents.compiled.references import (
     Reference,
     address_of,

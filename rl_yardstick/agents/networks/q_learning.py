@@ -14,15 +14,8 @@ from stable_baselines3.common.utils import update_learning_rate
 
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.exploration import first_best
-from rl_yardstick.agents.compiled.env_states import (
-    AFTER,
-    BEFORE,
-    Numbers,
-    look,
-    move_on,
-    observe,
-    show,
-)
+from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, Numbers, look, observe, show
+from rl_yardstick.agents.compiled.loop import move_on
 from rl_yardstick.agents.compiled.references import (
     Reference,
     address_of,
