@@ -61,11 +61,8 @@ class ArmPolicy(MaskBufferPolicy):
         best = [arms[row[arms].argmax()] for arms, row in zip(allowed, judged, strict=True)]
         return np.array(best, dtype=np.int64)
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         """The first of the best arms for each observation, shape (n,)."""
-        assert isinstance(observation, th.Tensor)
         observations = observation.numpy()
         if len(self.masks):
             rows = observations.astype(np.int64).reshape(-1)

@@ -223,10 +223,7 @@ class JsonAlgorithm(BaseAlgorithm):
     ) -> None:
         """Write the agent as a zip: JSON for its attributes, ``policy.pth`` for its tables.
 
-        Args:
-            path: the target; ``.zip`` is appended to a path without a suffix.
-            exclude: attributes to leave out.
-            include: attributes to write that are left out by default.
+        Arguments are the library's; ``.zip`` is appended to a path without a suffix.
         """
         left_out = {*self._excluded_save_params(), *self._rebuilt, *(exclude or ())}
         left_out -= set(include or ())

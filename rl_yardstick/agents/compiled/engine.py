@@ -231,9 +231,12 @@ class CompiledEngine:
         progress["total_timesteps"] = agent._total_timesteps
         progress["remaining"] = agent._current_progress_remaining
         progress["episodes"] = agent._episode_num
-        agent.hand_over(self.envs, self.progress)
+        self._read_agent()
         self.states.read()
         self.states.take_observations(agent._last_obs)
+
+    def _read_agent(self) -> None:
+        self.agent.hand_over(self.envs, self.progress)
 
 
 EngineChoice = Literal["auto", "compiled", "interpreted"]

@@ -163,13 +163,7 @@ VECTOR_STATES: dict[type, tuple[str, ...]] = {CartPole: STATE, MountainCar: CAR_
 
 
 class EnvStates:
-    """Environments, with a record for each of them.
-
-    Args:
-        vec_env: the environments.
-        world: their compiled counterpart.
-        seen: how to read its observations.
-    """
+    """Environments, with a record for each; ``seen`` reads observations of the compiled world."""
 
     def __init__(self, vec_env: DummyVecEnv, world: Any, seen: Any) -> None:
         self.vec_env = vec_env

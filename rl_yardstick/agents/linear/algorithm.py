@@ -320,11 +320,8 @@ class TilePolicy(TablePolicy):
             sums += weights[tiles]
         return sums
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         """The first of the best actions for each observation, shape (n,)."""
-        assert isinstance(observation, th.Tensor)
         return th.from_numpy(self.sums(observation.numpy()).argmax(axis=1))
 
 

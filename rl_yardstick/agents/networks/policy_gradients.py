@@ -607,7 +607,6 @@ class PolicyTraining(NetworkTraining):
 
     def read_settings(self) -> None:
         """Read settings that a callback may have changed."""
-        self.read_actor()
         self.read_tensors()
         self.held.rules[:] = self._rules(_bound)
 
@@ -731,7 +730,7 @@ class PolicyTraining(NetworkTraining):
         """Actions for the present observations, stored in the rollout with their values."""
         actions = np.zeros(self.agent.n_envs, np.int64)
         self.place["step"] = step
-        self.read_actor()
+        self.read_tensors()
         self.show(self.agent._last_obs)
         act_on_rows(self.learner, self.shown, actions)
         self.memory.held.observations[step] = self.shown

@@ -501,7 +501,6 @@ class QTraining(NetworkTraining):
 
     def read_settings(self) -> None:
         """Read settings that a callback may have changed."""
-        self.read_actor()
         self.read_tensors()
         self.held.rules[:] = self._rules()
         env = self.agent.get_vec_normalize_env()
@@ -544,7 +543,7 @@ class QTraining(NetworkTraining):
     def act(self, learning_starts: int) -> Ints:
         """Actions for the agent's present observations, with environments in Python."""
         self.read()
-        self.read_actor()
+        self.read_tensors()
         self.held.rules["learning_starts"] = learning_starts
         self.show(self.agent._last_obs)
         actions = np.zeros(len(self.shown), np.int64)

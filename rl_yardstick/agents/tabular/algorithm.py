@@ -112,9 +112,7 @@ class QTablePolicy(MaskBufferPolicy):
         masks = self.masks[obs]
         return np.where(masks | ~masks.any(axis=1, keepdims=True), values, -np.inf)
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         """The first of the best allowed actions for each observation, shape (n,)."""
         obs = numbers_in(self.observation_space, observation).reshape(-1)
         return th.from_numpy(self.allowed_values(obs).argmax(axis=1))
