@@ -7,7 +7,7 @@ import importlib
 import io
 import math
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache, partial
 from typing import Any
 
@@ -214,14 +214,15 @@ _FILLED = (
 _CALLED = (TrainFreq, TrainFrequencyUnit, GoalSelectionStrategy)
 
 
+def _called(make: Callable[..., Any], made: Made, build: Build) -> Any:
+    return make(*build(made.args))
+
+
 _MAKERS: Mapping[str, Maker] = {
     **_OF_TENSORS,
     **_OF_NUMPY,
     **{name: partial(filled, cls) for name, cls in by_name(_FILLED).items()},
-    **{
-        name: lambda made, build, cls=cls: cls(*build(made.args))
-        for name, cls in by_name(_CALLED).items()
-    },
+    **{name: partial(_called, cls) for name, cls in by_name(_CALLED).items()},
     # The arguments are its contents, always empty, and its maximum length.
     "collections.deque": lambda made, build: deque(build(made.items), *build(made.args[1:2])),
     "rl_zoo3.utils.SimpleLinearSchedule": lambda made, build: AffineTransform(

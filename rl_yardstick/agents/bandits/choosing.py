@@ -205,9 +205,9 @@ def allowed_room(n_arms: int) -> AllowedRoom:
 
 
 @inlined
-def allowed_bandit(agent: ScoreAgent, row: int, mask: Bools, room: AllowedRoom) -> ScoreAgent:
-    """The agent with a copy of its knowledge of the arms of ``mask`` in the context ``row``."""
-    tables, n, other_count, other_sum = agent.tables, 0, 0, 0.0
+def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom) -> ScoreTables:
+    """A copy of the knowledge of the arms of ``mask`` in the context ``row``."""
+    n, other_count, other_sum = 0, 0, 0.0
     for arm in range(len(mask)):
         if mask[arm]:
             room.arms[n] = arm
@@ -219,8 +219,7 @@ def allowed_bandit(agent: ScoreAgent, row: int, mask: Bools, room: AllowedRoom) 
             other_count += tables.counts[row, arm]
             other_sum += tables.sums[row, arm]
     scores, sums, counts = room.scores[:, :n], room.sums[:, :n], room.counts[:, :n]
-    known = ScoreTables(scores, sums, counts, other_count, other_sum)
-    return ScoreAgent(agent.settings, known, agent.feedback, agent.arms[:n], agent.draws, agent.rng)
+    return ScoreTables(scores, sums, counts, other_count, other_sum)
 
 
 @inlined
@@ -228,7 +227,9 @@ def choose_by_allowed_scores(
     agent: ScoreAgent, row: int, mask: Bools, room: AllowedRoom, progress: Any
 ) -> tuple[int, float]:
     """The rule's choice in the smaller bandit, and its probability."""
-    smaller = allowed_bandit(agent, row, mask, room)
+    known = allowed_tables(agent.tables, row, mask, room)
+    numbers = agent.arms[: known.scores.shape[1]]
+    smaller = ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
     chosen = choose_arm(smaller, 0, progress)
     return int(room.arms[chosen]), choice_probability(smaller, 0, chosen)
 
@@ -237,8 +238,10 @@ def choose_by_allowed_scores(
 def learn_one(agent: ScoreAgent, pull: Any, mask: Bools, room: AllowedRoom, progress: Any) -> None:
     """Learn from a pull at which the arms in ``mask`` were allowed, of shape (arms,)."""
     tables, row, place = agent.tables, pull.row, 0
-    smaller = allowed_bandit(agent, row, mask, room)
-    n = len(smaller.arms)
+    known = allowed_tables(tables, row, mask, room)
+    n = known.scores.shape[1]
+    numbers = agent.arms[:n]
+    smaller = ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
     for k in range(n):
         if room.arms[k] == pull.arm:
             place = k

@@ -63,7 +63,7 @@ class QTablePolicy(MaskBufferPolicy):
 
     q_tables: th.Tensor  # action values, float64 of shape (T, S, A)
     visit_counts: th.Tensor  # number of updates of each entry, int64 of shape (T, S, A)
-    sizes = ("n_tables",)
+    sizes: ClassVar[tuple[str, ...]] = ("n_tables",)
 
     def __init__(self, *args: Any, n_tables: int = 1, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
