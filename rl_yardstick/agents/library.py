@@ -100,19 +100,16 @@ class DQN(CompiledQLearning):
 
     def _setup_model(self) -> None:
         if self.mask_actions:
-            self._check_maskable()
+            if self.n_steps != 1:
+                raise ValueError(f"mask_actions needs n_steps of 1, not {self.n_steps}")
+            if isinstance(self.observation_space, spaces.Dict):
+                raise ValueError("mask_actions does not work with Dict observations")
+            if self.replay_buffer_class not in {None, ReplayBuffer, MaskedReplayBuffer}:
+                raise ValueError("mask_actions needs its own replay buffer, no replay_buffer_class")
+            if self.env is not None:
+                check_masks_exist(self.env)
             self.replay_buffer_class = MaskedReplayBuffer
         super()._setup_model()
-
-    def _check_maskable(self) -> None:
-        if self.n_steps != 1:
-            raise ValueError(f"mask_actions needs n_steps of 1, not {self.n_steps}")
-        if isinstance(self.observation_space, spaces.Dict):
-            raise ValueError("mask_actions does not work with Dict observations")
-        if self.replay_buffer_class not in {None, ReplayBuffer, MaskedReplayBuffer}:
-            raise ValueError("mask_actions brings its own replay buffer: leave replay_buffer_class")
-        if self.env is not None:
-            check_masks_exist(self.env)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         prepared = super()._setup_learn(*args, **kwargs)

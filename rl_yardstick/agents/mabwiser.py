@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -10,71 +10,65 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from rl_yardstick.agents.bandits.algorithm import BINARY, BanditAlgorithm, Pull
-from rl_yardstick.agents.bandits.linear import features
+from rl_yardstick.agents.bandits.linear import features, number_of_features
 from rl_yardstick.agents.common.model_files import TablePolicy
 from rl_yardstick.agents.common.settings import NOT_NEGATIVE, SHARE, check_space, check_vectors
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
-
-class Kind(NamedTuple):
-    """One of MABWiser's learning policies."""
-
-    settings: dict[str, str]  # its arguments, and the attributes of our agent that they come from
-    statistics: tuple[str, ...]  # where it keeps its state; nothing for the models of LinUCB
-
-
+# MABWiser's learning policies: their arguments, with the attributes of our agents that hold them;
+# and where they keep their state, in dictionaries by arm or in the attributes of LinUCB's models.
 SUMS = ("arm_to_sum", "arm_to_count", "arm_to_expectation")
-KINDS = {
-    "EpsilonGreedy": Kind({"epsilon": "exploration_initial_eps"}, SUMS),
-    "UCB1": Kind({"alpha": "c"}, (*SUMS, "arm_to_mean")),
-    "ThompsonSampling": Kind({}, ("arm_to_success_count", "arm_to_fail_count")),
+KINDS: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
+    "EpsilonGreedy": ({"epsilon": "exploration_initial_eps"}, SUMS),
+    "UCB1": ({"alpha": "c"}, (*SUMS, "arm_to_mean")),
+    "ThompsonSampling": ({}, ("arm_to_success_count", "arm_to_fail_count")),
     # With another ridge than 1, the library is wrong about untried arms.
-    "LinUCB": Kind({"alpha": "alpha"}, ()),
+    "LinUCB": ({"alpha": "alpha"}, ("A", "A_inv", "Xty", "beta")),
 }
 
 
 class MABWiserPolicy(TablePolicy):
     """Holds a `mabwiser.mab.MAB` over arms numbered from 0, and saves its objects as one tensor."""
 
+    sizes = ("kind", "settings")
+
     def __init__(self, *args: Any, kind: str, settings: dict[str, float], **kwargs: Any) -> None:
         from mabwiser.mab import MAB, LearningPolicy
 
         super().__init__(*args, **kwargs)
         self.kind, self.settings = kind, settings
-        self.statistics = KINDS[kind].statistics
         arms = range(int(self.action_space.n))  # type: ignore[attr-defined]
         self.mab: Any = MAB(list(arms), getattr(LearningPolicy, kind)(**self.settings))
-        self.fitted = False
+        self.fitted, self.reads_contexts = False, kind == "LinUCB"
 
-    def _sizes(self) -> dict[str, Any]:
-        return {"kind": self.kind, "settings": self.settings}
+    def _places(self, arm: int) -> list[tuple[dict[Any, Any], Any]]:
+        """Where the library keeps the state of an arm: dictionaries and keys."""
+        inside, names = self.mab._imp, KINDS[self.kind][1]
+        if self.reads_contexts:
+            return [(vars(inside.arm_to_model[arm]), name) for name in names]
+        return [(getattr(inside, name), arm) for name in names]
 
     @property
     def parts(self) -> Floats:
         """The state: a row of numbers for each arm, shape (arms, ...)."""
-        inside, arms = self.mab._imp, self.mab.arms
-        if self.statistics:
-            rows = [[getattr(inside, name)[arm] for name in self.statistics] for arm in arms]
-            return np.array(rows, dtype=np.float64)
-        models = [inside.arm_to_model[arm] for arm in arms]
-        return np.stack([np.concatenate([m.A, m.A_inv, m.Xty, m.beta], None) for m in models])
+        rows = [[place[key] for place, key in self._places(arm)] for arm in self.mab.arms]
+        return np.stack([np.concatenate(row, axis=None) for row in rows]).astype(np.float64)
 
     def learn(self, arm: int, reward: float, context: Floats) -> None:
         """Let the library learn from one reward in ``context``, of shape (features,)."""
         learn = self.mab.partial_fit if self.fitted else self.mab.fit
-        learn([arm], [reward], *(() if self.statistics else (context[None],)))
+        learn([arm], [reward], context[None] if self.reads_contexts else None)
         self.fitted = True
 
     def judged(self, contexts: Floats) -> Floats:
         """The estimated mean reward of each arm, shape (n, arms)."""
         if not self.fitted:
             return np.zeros((len(contexts), len(self.mab.arms)))
-        if not self.statistics:
+        if self.reads_contexts:
             models = self.mab._imp.arm_to_model
             return np.stack([contexts @ models[arm].beta for arm in self.mab.arms], axis=1)
         won, seen = self.parts[:, 0], self.parts[:, 1]
-        if self.kind == "ThompsonSampling":
-            seen = won + seen
+        seen = won + seen if self.kind == "ThompsonSampling" else seen
         means = np.divide(won, seen, out=np.full(len(won), -np.inf), where=seen > 0)
         return np.tile(means, (len(contexts), 1))
 
@@ -88,24 +82,18 @@ class MABWiserPolicy(TablePolicy):
         return th.from_numpy(self.parts) if self.fitted else th.zeros(0, dtype=th.float64)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        """Copy the state of another policy of this kind."""
+        """Make the library's objects, with the state of another policy of this kind."""
         if len(state) == 0:
             return
-        if len(state) != len(self.mab.arms):
-            raise ValueError(f"holds {len(state)} arms, not {len(self.mab.arms)}")
-        shown = np.zeros((1, *(self.observation_space.shape or ())))
-        context, inside = features(self.observation_space, shown)[0], self.mab._imp
-        self.learn(0, 0.0, 0.0 * context)  # makes the library's objects
-        n = len(context)
-        for arm, row in enumerate(state.numpy()):
-            for name, value in zip(self.statistics, row.tolist(), strict=bool(self.statistics)):
-                getattr(inside, name)[arm] = value
-            if not self.statistics:
-                model, ends = inside.arm_to_model[arm], np.cumsum([n * n, n * n, n])
-                a, a_inv, model.Xty, model.beta = np.split(row.copy(), ends)
-                model.A, model.A_inv = a.reshape(n, n), a_inv.reshape(n, n)
-        if self.statistics:
-            inside.total_count = float(state[:, 1].sum())
+        self.learn(0, 0.0, np.zeros(number_of_features(self.observation_space)))
+        if state.shape != self.parts.shape:
+            raise ValueError(f"holds arms of shape {tuple(state.shape)}, not {self.parts.shape}")
+        for arm, rest in enumerate(state.numpy().copy()):
+            for place, key in self._places(arm):
+                part, rest = np.split(rest, [np.size(place[key])])  # noqa: PLW2901
+                place[key] = part.reshape(np.shape(place[key]))[()]
+        if not self.reads_contexts:
+            self.mab._imp.total_count = float(state[:, 1].sum())
 
 
 class MABWiserAgent(BanditAlgorithm):
@@ -114,7 +102,6 @@ class MABWiserAgent(BanditAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MABWiserPolicy": MABWiserPolicy}
     policy: MABWiserPolicy
     kind: ClassVar[str]  # one of `KINDS`
-
     hidden_arguments = ("learning_rate", "mask_actions", "tie_breaking")
 
     def __init__(
@@ -124,13 +111,13 @@ class MABWiserAgent(BanditAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        if KINDS[self.kind].statistics:
-            check_space(self, "observations", self.observation_space)
-        else:
+        if self.kind == "LinUCB":
             check_vectors(self, self.observation_space)
+        else:
+            check_space(self, "observations", self.observation_space)
 
     def _policy_arguments(self) -> dict[str, Any]:
-        settings = {name: getattr(self, ours) for name, ours in KINDS[self.kind].settings.items()}
+        settings = {name: getattr(self, ours) for name, ours in KINDS[self.kind][0].items()}
         return {"kind": self.kind, "settings": settings}
 
     def _contexts(self, obs: NDArray[Any]) -> Floats:
@@ -142,11 +129,10 @@ class MABWiserAgent(BanditAlgorithm):
         # The library needs a reward first, and would take an untried arm's mean reward for 0.
         mab, first = self.policy.mab, None if self.policy.fitted else 0
         if self.kind == "UCB1":
-            counts = mab._imp.arm_to_count
-            first = next((arm for arm in mab.arms if counts[arm] == 0), None)
+            first = next((arm for arm in mab.arms if not mab._imp.arm_to_count[arm]), None)
         mab._rng.rng = rng
-        told = [() if self.policy.statistics else (context[None],) for context in contexts]
-        arms = [int(mab.predict(*each)) if first is None else first for each in told]
+        told = [context[None] if self.policy.reads_contexts else None for context in contexts]
+        arms = [int(mab.predict(each)) if first is None else first for each in told]
         return np.array(arms, dtype=np.int64), np.ones(len(arms))
 
     def _learn(self, pull: Pull) -> None:

@@ -7,7 +7,7 @@ agent.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -52,20 +52,12 @@ class RandomPolicy(TablePolicy):
 class AnglePolicy(TablePolicy):
     """Push the cart towards the side that the pole leans to."""
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
-        assert isinstance(observation, th.Tensor)
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         return th.where(observation[:, POLE_ANGLE] > 0, RIGHT, LEFT)
 
 
 class ReferenceAgent(OnlineAlgorithm):
-    """Acts by a fixed policy; training it changes nothing but its counters.
-
-    Args:
-        policy: name of the policy.
-        env: environment, or its id.
-    """
+    """Acts by a fixed policy; training it changes nothing but its counters."""
 
     hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
 
@@ -137,9 +129,7 @@ class ActionTablePolicy(TablePolicy):
             self.actions = th.zeros_like(state_dict["actions"])
         return super().load_state_dict(state_dict, strict, assign)
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         obs = numbers_in(self.observation_space, observation).reshape(-1)
         return th.from_numpy(self.actions_after(obs, np.zeros(len(obs), dtype=np.int64)))
 
@@ -161,7 +151,8 @@ class PlanningAgent(OnlineAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ActionTablePolicy": ActionTablePolicy}
     policy: ActionTablePolicy
-    default_gamma: ClassVar[float]
+    default_gamma: ClassVar[float] = 0.99
+    planner: ClassVar[Callable[..., Any]]
     hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
 
     def __init__(
@@ -216,9 +207,9 @@ class PlanningAgent(OnlineAlgorithm):
             raise ValueError(f"{name} needs observations that tell the states apart")
         self.policy.set_actions(actions, horizon)
 
-    @abstractmethod
     def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
         """The plan under a time limit, among the actions of ``mask``, bool of shape (S, A)."""
+        return type(self).planner(model, self.gamma, mask=mask).policy[None], 1
 
     def _choose_actions(self) -> Ints:
         actions = self.policy.actions_after(np.asarray(self._last_obs), self._steps)
@@ -237,14 +228,9 @@ class PlanningAgent(OnlineAlgorithm):
     ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
         """The planned actions; ``state`` carries the number of steps of each episode so far.
 
-        Args:
-            observation: one state index, or an array of shape (n,).
-            state: what the last call returned, or None at the start.
-            episode_start: whether an episode begins, shape (n,).
-            deterministic: not used, as plans are.
-
-        Returns:
-            Actions, of the observation's shape, and the new ``state``.
+        Takes one state index or an array of shape (n,), and returns actions of the same shape and
+        the new ``state``, which is None at the start. ``episode_start`` of shape (n,) tells whether
+        an episode begins; ``deterministic`` is not used, as plans are.
         """
         obs = numbers_in(self.observation_space, observation)
         steps = np.zeros(obs.size, dtype=np.int64) if state is None else state[0].copy()
@@ -260,10 +246,7 @@ class ValueIteration(PlanningAgent):
     Without a discount, shorter and longer ways to the goal may have the same value.
     """
 
-    default_gamma = 0.99
-
-    def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
-        return value_iteration(model, self.gamma, mask=mask).policy[None], 1
+    planner = staticmethod(value_iteration)
 
 
 class PolicyIteration(PlanningAgent):
@@ -272,10 +255,7 @@ class PolicyIteration(PlanningAgent):
     It takes few rounds, each of which solves a linear system: for up to about 10,000 states.
     """
 
-    default_gamma = 0.99
-
-    def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
-        return policy_iteration(model, self.gamma, mask=mask).policy[None], 1
+    planner = staticmethod(policy_iteration)
 
 
 class Optimal(PlanningAgent):

@@ -356,11 +356,7 @@ def fitting_algorithms(
 ) -> list[str]:
     """Names of the agents that can work with these spaces, in the order of the registry.
 
-    Args:
-        observation_space: the environment's observation space.
-        action_space: the environment's action space.
-        bandit: whether the environment is a bandit.
-        masks: whether the environment provides action masks.
+    ``bandit``: whether the environment is one; ``masks``: whether it provides action masks.
     """
     return [
         name

@@ -126,17 +126,16 @@ def _scale_lines(yardstick: Yardstick) -> list[str]:
     hidden, most = yardstick.hidden, yardstick.optimum
     if hidden is None and yardstick.at_least is None:
         return lines
-    optima = [_between(most if yardstick.at_least is None else yardstick.at_least, most)]
+    least = most if yardstick.at_least is None else yardstick.at_least
+    optima = [" to ".join(dict.fromkeys(figures(least, most)))]
     optima[0] += "" if yardstick.is_proven else " (the upper end is not proven)"
     if hidden is not None:
         optima[0] += " with memory" if hidden.with_memory else " without memory"
-        memory = [] if hidden.with_memory else [f"{_between(*hidden.memory_optimum)} with memory"]
-        optima += [*memory, f"{figures(hidden.full_optimum)[0]} by the state"]
+        if not hidden.with_memory:
+            known = dict.fromkeys(figures(*hidden.memory_optimum))
+            optima.append(f"{' to '.join(known)} with memory")
+        optima.append(f"{figures(hidden.full_optimum)[0]} by the state")
     return [*lines, f"optimum{APART}{', '.join(optima)}"]
-
-
-def _between(lower: float, upper: float) -> str:
-    return " to ".join(dict.fromkeys(figures(lower, upper)))
 
 
 def _score(yardstick: Yardstick, value: float) -> str:

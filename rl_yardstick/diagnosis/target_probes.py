@@ -13,7 +13,7 @@ import numpy as np
 
 from rl_yardstick.diagnosis.faults import UNEXPLAINED, Finding, checked
 from rl_yardstick.diagnosis.probe_worlds import ARM_0, CHAIN, SAFE_FORK, World
-from rl_yardstick.diagnosis.subjects import GAMMA, ClassSubject, Lab, Subject, Trained
+from rl_yardstick.diagnosis.subjects import GAMMA, ClassSubject, Lab, Subject
 from rl_yardstick.mdp.transition_model import Floats
 
 SEES_START = replace(CHAIN, end_shows=0)
@@ -253,18 +253,16 @@ def probe_traces(lab: Lab) -> Finding | None:
         return None
     settings = {"trace_decay": decay, "learning_rate": 0.5}
     greedy = {**settings, "exploration_initial_eps": 0.0, "exploration_final_eps": 0.0}
-    first = _highest(lab.begin(World(((0, 0), (0, 0), (1, 1))), 3, **greedy))
+    found: Any = lab.begin(World(((0, 0), (0, 0), (1, 1))), 3, **greedy).values()
+    first = np.max(found, axis=1)
     ratio = first[1] / first[2] if first[2] else np.nan
     text = f"after one episode a state's value is {ratio:.2f} times that of the next state"
     right = f"gamma x lambda, which is {GAMMA * decay:g}"
     if not abs(ratio - GAMMA * decay) < 0.05 or abs(first[0] - ratio**2 * first[2]) > 0.05:
         return Finding("fault", text, "traces", right)
-    later = _highest(lab.begin(World(((5, 5), (0, 0), (1, 1))), 4, **greedy))
+    found = lab.begin(World(((5, 5), (0, 0), (1, 1))), 4, **greedy).values()
+    later = np.max(found, axis=1)
     if abs(later[2] - first[2]) > 0.05:
         told = f"the next episode's first reward changes the last state from {first[2]:.2f} to "
         return Finding("fault", f"{told}{later[2]:.2f}", "traces", "it changes nothing")
     return Finding("ok", text)
-
-
-def _highest(trained: Trained) -> Any:
-    return np.max(trained.values(), axis=1)  # type: ignore[arg-type]

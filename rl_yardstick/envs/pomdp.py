@@ -153,6 +153,8 @@ def _tiger(accuracy: float) -> World:
 
 
 ROWS = ("...........", "##.#.#.#G##")
+# Row and column of each cell, row by row; the goal is the last one.
+CELLS = [(y, x) for y, row in enumerate(ROWS) for x, letter in enumerate(row) if letter != "#"]
 # North, east, south, west; numbers of facings.
 STEPS = ((-1, 0), (0, 1), (1, 0), (0, -1))
 SOUTH = 2
@@ -231,25 +233,19 @@ class HallwayEnv(MapEnv):
         return readings
 
     def cell_of(self, state: int) -> int:
-        row, column = _cells()[int(_hallway().hidden[state]) // len(STEPS)]
+        row, column = CELLS[int(_hallway().hidden[state]) // len(STEPS)]
         return row * len(ROWS[0]) + column
-
-
-def _cells() -> list[tuple[int, int]]:
-    """Row and column of each cell, row by row; the goal is the last one."""
-    return [(y, x) for y, row in enumerate(ROWS) for x, letter in enumerate(row) if letter != "#"]
 
 
 @lru_cache(maxsize=1)
 def _hallway() -> World:
-    cells = _cells()
-    n_states = len(cells) * len(STEPS)
+    n_states = len(CELLS) * len(STEPS)
     prob = np.zeros((n_states, 2 + len(TURNS), len(MOVES) + 1))
     next_state = np.zeros(prob.shape, np.int64)
     readings = np.zeros((n_states, N_READINGS))
-    signs = [cell for cell in cells if (cell[0] + 1, cell[1]) in cells]
+    signs = [cell for cell in CELLS if (cell[0] + 1, cell[1]) in CELLS]
     for state in range(n_states):
-        (row, column), facing = cells[state // len(STEPS)], state % len(STEPS)
+        (row, column), facing = CELLS[state // len(STEPS)], state % len(STEPS)
         beside = [
             (row + STEPS[(facing + turn) % 4][0], column + STEPS[(facing + turn) % 4][1])
             for turn in range(4)
@@ -261,18 +257,18 @@ def _hallway() -> World:
             next_state[state, action, :4] = state - facing + (facing + np.arange(4)) % 4
         for k, (way, turn, chance) in enumerate(MOVES):
             prob[state, FORWARD, k] = chance
-            if beside[way] in cells:
-                place = cells.index(beside[way])
+            if beside[way] in CELLS:
+                place = CELLS.index(beside[way])
                 next_state[state, FORWARD, k] = 4 * place + (facing + turn) % 4
         prob[state, FORWARD, -1] = 1 - sum(chance for _, _, chance in MOVES)
-        if cells[-1] == (row, column):
+        if CELLS[-1] == (row, column):
             readings[state, -1] = 1
         elif facing == SOUTH and (row, column) in signs:
             readings[state, N_WALL_READINGS + signs.index((row, column))] = 1
         else:
-            readings[state, :N_WALL_READINGS] = _wall_readings([b not in cells for b in beside])
-    at_goal = next_state // len(STEPS) == len(cells) - 1
-    is_over = np.arange(n_states) // len(STEPS) == len(cells) - 1
+            readings[state, :N_WALL_READINGS] = _wall_readings([b not in CELLS for b in beside])
+    at_goal = next_state // len(STEPS) == len(CELLS) - 1
+    is_over = np.arange(n_states) // len(STEPS) == len(CELLS) - 1
     reward = np.where(is_over[:, None, None], 0.0, at_goal.astype(np.float64))
     initial = np.where(is_over, 0.0, 1 / (~is_over).sum())
     hidden = TransitionModel(prob, next_state, reward, at_goal, initial)

@@ -12,7 +12,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from rl_yardstick.experiments.bandits import STATISTICS_FILE, PullStatistics, read_pulls, run_regret
 from rl_yardstick.experiments.plan import Labels, PlannedRun
@@ -35,13 +34,6 @@ from rl_yardstick.verdicts import (
 # --- the files of one run -------------------------------------------------------------------------
 
 MAX_TABLE = 1 << 31  # bytes of a file of a run
-_MAPS = {
-    "timesteps": "n",
-    "values": "n states",
-    "actions": "n states",
-    "optimal_values": "states",
-    "optimal_actions": "states choices",
-}
 
 
 @dataclass(frozen=True)
@@ -86,11 +78,6 @@ def read_evaluations(folder: Path) -> tuple[Floats, Floats]:
         return np.empty(0), np.empty(0)
     arrays = read_arrays(path, {"timesteps": "n", "results": "n episodes"})
     return arrays["timesteps"].astype(np.float64), arrays["results"].mean(axis=1, dtype=np.float64)
-
-
-def read_value_maps(folder: Path) -> dict[str, NDArray[Any]]:
-    """Read the maps of a run that `pipeline.evaluation.value_maps` wrote."""
-    return read_arrays(folder / "value_maps.npz", _MAPS)
 
 
 def read_compared(folder: Path) -> dict[str, Floats]:

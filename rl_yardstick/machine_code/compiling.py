@@ -6,8 +6,7 @@ for Python and C: such a `Part` is compiled to LLVM's intermediate representatio
 there into the code of each caller.
 
 Numba discards cached code when the function's own file changes, but not when the file of an inlined
-function does. So all code is in a folder named by a digest of every source and of the versions of
-the compilers. Code with other sources, such as a user's update rule, is not cached.
+function does. So all code is in a folder named by a digest of all our sources and of compilers.
 """
 
 # mypy: allow-untyped-calls

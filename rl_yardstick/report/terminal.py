@@ -144,12 +144,12 @@ def _fitting(
             made.add_row(folded(name, width), *row)
         return made
 
-    def room() -> int:
-        return console.width - _width(console, table(LEAST_AGENT_WIDTH)) + LEAST_AGENT_WIDTH
-
-    while to_leave_out and min(longest, MOST_AGENT_WIDTH) > room():
+    while True:
+        room = console.width - _width(console, table(LEAST_AGENT_WIDTH)) + LEAST_AGENT_WIDTH
+        if not to_leave_out or min(longest, MOST_AGENT_WIDTH) <= room:
+            break
         left_out.append(to_leave_out.pop(0))
-    result = table(min(longest, most, max(room(), LEAST_AGENT_WIDTH)))
+    result = table(min(longest, most, max(room, LEAST_AGENT_WIDTH)))
     needed = _width(console, result)
     result.width = needed if needed > console.width else None
     return result, left_out

@@ -311,17 +311,15 @@ class Search:
     def _is_hopeless(self, each: _UnderWay) -> bool:
         """Whether a trial can no longer be the best, by its seeds so far."""
         sign = -1.0 if self.tuning.is_cost else 1.0  # costs change their sign: higher is better
-
-        def scores(runs: Mapping[int, RunOutcome]) -> dict[int, float]:
-            return {seed: sign * run.figure for seed, run in runs.items()}
-
         # A score of 1 is the optimum. Without a known optimum, figures are returns, for which 1
         # means nothing.
         are_scores = any(run.name == "score" for run in each.runs.values())
-        others = [trial for trial in self.trials if trial.number != each.trial.number]
+        others = [outcomes_of(t) for t in self.trials if t.number != each.trial.number]
+        tried = [each.runs, *others]
+        own, *scores = [{s: sign * run.figure for s, run in runs.items()} for runs in tried]
         return is_hopeless(
-            scores(each.runs),
-            [scores(outcomes_of(trial)) for trial in others],
+            own,
+            scores,
             lambda values: sign * self.tuning.value([sign * value for value in values]),
             n_seeds=len(self.tuning.seeds),
             ceiling=1.0 if are_scores else -math.inf,

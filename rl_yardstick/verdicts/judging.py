@@ -124,9 +124,6 @@ class _Rules(NamedTuple):
     paired: bool
     against: str
 
-    def ends(self, environment: str) -> Bounds:
-        return _of(self.bounds, environment) or UNBOUNDED
-
 
 def judge(
     scores: Scores,
@@ -247,7 +244,8 @@ def _study(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> 
     agents: list[AgentRuns] = []
     best, thresholds = {}, {}
     for environment, runs in scores.items():
-        baseline, ends = _of(rules.baseline, environment), rules.ends(environment)
+        baseline = _of(rules.baseline, environment)
+        ends = _of(rules.bounds, environment) or UNBOUNDED
         threshold = thresholds[environment] = failure_threshold(baseline, runs.values())
         here = [describe(environment, name, runs[name], ends, threshold) for name in runs]
         agents += here
@@ -259,7 +257,8 @@ def _study(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> 
 def _pair(rules: _Rules, key: Key, evidence: _Evidence, found: _Words) -> Pair:
     word, margin = found.words[key], _of(rules.margin, key[0])
     shown = {"tied": evidence.tied[1], "undecided": evidence.last}.get(word, evidence.different[1])
-    low, high = tests.difference_interval(shown, found.levels[0], rules.ends(key[0]))
+    ends = _of(rules.bounds, key[0]) or UNBOUNDED
+    low, high = tests.difference_interval(shown, found.levels[0], ends)
     least = {"better": 0.0, "tied": -margin}.get(word, -np.inf)
     most = {"worse": 0.0, "tied": margin}.get(word, np.inf)
     is_open, few = word == "undecided", FEW_FOR_TIES if word == "tied" else FEW

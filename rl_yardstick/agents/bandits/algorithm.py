@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
@@ -12,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from rl_yardstick.agents.bandits.choosing import (
@@ -29,7 +30,6 @@ from rl_yardstick.agents.common.masks import (
     checked_masks,
     present_masks,
 )
-from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import EPSILONS, ExplorationDecay, check_space
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
 from rl_yardstick.agents.compiled.worlds import NotCompilable
@@ -61,11 +61,8 @@ class ArmPolicy(MaskBufferPolicy):
         best = [arms[row[arms].argmax()] for arms, row in zip(allowed, judged, strict=True)]
         return np.array(best, dtype=np.int64)
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         """The first of the best arms for each observation, shape (n,)."""
-        assert isinstance(observation, th.Tensor)
         observations = observation.numpy()
         if len(self.masks):
             rows = observations.astype(np.int64).reshape(-1)
@@ -306,6 +303,10 @@ class RuleBandit(BanditAlgorithm):
 
     act = act_in_context
     learn_from_step = learn_from_feedback
+    compiled_agent: ClassVar[Callable[..., Any]]  # with room for ``capacity`` pulls
+
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
+        return self.compiled_agent(rng, capacity=n)
 
     @abstractmethod
     def _rows(self, agent: Any, contexts: Any) -> tuple[Ints, int]:
@@ -354,6 +355,3 @@ class EpsilonGreedyBandit(RuleBandit):
         self.exploration_fraction = exploration_fraction
         self.exploration_decay = exploration_decay
         super().__init__(*args, **kwargs)
-
-    def _make_exploration_schedule(self) -> Schedule:
-        return epsilon_schedule(self)

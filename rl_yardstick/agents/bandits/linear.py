@@ -40,9 +40,11 @@ class LinearBanditPolicy(ArmPolicy):
     moments: th.Tensor  # sum of reward times context, float64 of shape (A, d)
     coefficients: th.Tensor  # of each arm's regression, float64 of shape (A, d)
     counts: th.Tensor  # number of rewards of each arm, int64 of shape (A,)
+    sizes = ("ridge",)
 
     def __init__(self, *args: Any, ridge: float = 1.0, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.ridge = ridge
         n_arms = int(self.action_space.n)  # type: ignore[attr-defined]
         n_features = number_of_features(self.observation_space)
         identity = ridge * th.eye(n_features, dtype=th.float64)
@@ -145,9 +147,6 @@ class LinearBanditAgent(RuleBandit):
         super()._check_arguments()
         check_vectors(self, self.observation_space)
 
-    def _policy_arguments(self) -> dict[str, Any]:
-        return {"ridge": self.ridge}
-
     def compiled_agent(
         self,
         rng: np.random.Generator,
@@ -169,9 +168,6 @@ class LinearBanditAgent(RuleBandit):
             np.empty(2),
             handles_of([rng])[0],
         )
-
-    def _make_workspace(self, rng: np.random.Generator, n: int) -> LinearAgent:
-        return self.compiled_agent(rng, capacity=n)
 
     def _contexts(self, obs: NDArray[Any]) -> Floats:
         return features(self.observation_space, obs)

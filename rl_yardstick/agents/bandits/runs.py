@@ -457,19 +457,11 @@ def run_one_by_one(
     cls = load_algorithm(algorithm) if isinstance(algorithm, str) else algorithm
     numbers = list(seeds)
     runs = [_run(cls, kwargs or {}, env_id, env_kwargs or {}, seed, pulls) for seed in numbers]
-
-    def stacked(name: str) -> Any:
-        return np.stack([run[name] for run in runs]) if name in runs[0] else None
-
-    return BatchResult(
-        np.array(numbers, dtype=np.int64),
-        stacked("arms"),
-        stacked("rewards"),
-        stacked("regrets"),
-        stacked("contexts"),
-        stacked("estimates"),
-        stacked("coefficients"),
-    )
+    names = ("arms", "rewards", "regrets", "contexts", "estimates", "coefficients")
+    found: dict[str, Any] = {
+        name: np.stack([run[name] for run in runs]) for name in names if name in runs[0]
+    }
+    return BatchResult(np.array(numbers, dtype=np.int64), **found)
 
 
 def _run(

@@ -43,18 +43,17 @@ class BanditPolicy(ArmPolicy):
     scores: th.Tensor  # of the arms, float64 of shape (C, A)
     sums: th.Tensor  # sum of the rewards, float64 of shape (C, A)
     counts: th.Tensor  # number of the rewards, int64 of shape (C, A)
+    sizes = ("n_contexts",)
 
     def __init__(
         self, *args: Any, n_contexts: int = 1, initial_score: float = 0.0, **kwargs: Any
     ) -> None:
         super().__init__(*args, **kwargs)
+        self.n_contexts = n_contexts
         shape = (n_contexts, int(self.action_space.n))  # type: ignore[attr-defined]
         self.register_buffer("scores", th.full(shape, initial_score, dtype=th.float64))
         self.register_buffer("sums", th.zeros(shape, dtype=th.float64))
         self.register_buffer("counts", th.zeros(shape, dtype=th.int64))
-
-    def _sizes(self) -> dict[str, Any]:
-        return {"n_contexts": len(self.scores)}
 
     @property
     def tables(self) -> ScoreTables:
@@ -130,9 +129,6 @@ class TableBandit(RuleBandit):
             np.empty(2),
             handles_of([rng])[0],
         )
-
-    def _make_workspace(self, rng: np.random.Generator, n: int) -> ScoreAgent:
-        return self.compiled_agent(rng)
 
     def _contexts(self, obs: NDArray[Any]) -> Ints:
         rows = obs.astype(np.int64).reshape(-1)

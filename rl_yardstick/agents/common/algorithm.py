@@ -122,16 +122,8 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
     ) -> Self:
         """Train for at least ``total_timesteps`` environment steps.
 
-        Args:
-            total_timesteps: number of steps, counted over all environments.
-            callback: one or several callbacks, called at every step.
-            log_interval: episodes between two log records, or None for none.
-            tb_log_name: name of the TensorBoard run; by default the class's name.
-            reset_num_timesteps: restart the step count at 0 instead of continuing it.
-            progress_bar: show one.
-
-        Returns:
-            The agent itself.
+        Arguments are the library's. Steps are counted over all environments; ``log_interval`` is in
+        episodes, None for no log; ``tb_log_name`` is the class's name by default.
         """
         tb_log_name = tb_log_name or type(self).__name__
         total_timesteps, callback = self._setup_learn(

@@ -223,10 +223,7 @@ class JsonAlgorithm(BaseAlgorithm):
     ) -> None:
         """Write the agent as a zip: JSON for its attributes, ``policy.pth`` for its tables.
 
-        Args:
-            path: the target; ``.zip`` is appended to a path without a suffix.
-            exclude: attributes to leave out.
-            include: attributes to write that are left out by default.
+        Arguments are the library's; ``.zip`` is appended to a path without a suffix.
         """
         left_out = {*self._excluded_save_params(), *self._rebuilt, *(exclude or ())}
         left_out -= set(include or ())
@@ -395,6 +392,9 @@ def _zipped(data: Mapping[str, Any], params: dict[str, Any]) -> bytes:
 class TablePolicy(BasePolicy):
     """A policy that stores what it has learnt in buffers on the CPU."""
 
+    # The constructor's arguments that determine the buffers; attributes have the same names.
+    sizes: ClassVar[tuple[str, ...]] = ()
+
     def __init__(
         self,
         observation_space: spaces.Space[Any],
@@ -404,9 +404,6 @@ class TablePolicy(BasePolicy):
     ) -> None:
         super().__init__(observation_space, action_space, **kwargs)
 
-    def _sizes(self) -> dict[str, Any]:
-        """The constructor's arguments that determine the shapes of the buffers."""
-        return {}
-
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), **self._sizes()}
+        sizes = {name: getattr(self, name) for name in self.sizes}
+        return {**super()._get_constructor_parameters(), **sizes}

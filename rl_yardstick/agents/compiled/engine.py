@@ -238,9 +238,12 @@ class CompiledEngine:
         progress["total_timesteps"] = agent._total_timesteps
         progress["remaining"] = agent._current_progress_remaining
         progress["episodes"] = agent._episode_num
-        agent.hand_over(self.envs, self.progress)
+        self._read_agent()
         self.states.read()
         self.states.take_observations(agent._last_obs)
+
+    def _read_agent(self) -> None:
+        self.agent.hand_over(self.envs, self.progress)
 
 
 EngineChoice = Literal["auto", "compiled", "interpreted"]
@@ -323,17 +326,12 @@ class Plan(NamedTuple):
     """A player with a fixed action for each observed number."""
 
     actions: Ints  # one for each number, shape (S,)
+    seen: Any  # how observations are read
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:
         """Look the action up."""
         env.action = self.actions[env.obs]
-
-    @inlined
-    def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Learn nothing; move on to the next observations."""
-        for i in range(len(envs)):
-            envs[i].obs = envs[i].new_obs
 
 
 # Environments for evaluation, their compiled counterpart, and what converts its observations.

@@ -46,11 +46,6 @@ def observe(seen: Any, env: Any, moment: int, row: Any) -> None:
     """Write the observation at this moment of the environment's last step into ``row``."""
 
 
-@by_type
-def move_on(seen: Any, env: Any) -> None:
-    """Make the new observation the one that the next action is chosen for."""
-
-
 @inlined
 def number_at(env: Any, moment: int) -> int:
     """The number of the observation."""
@@ -86,11 +81,6 @@ class Numbers(NamedTuple):
         """The number itself, shape (1,)."""
         row[0] = number_at(env, moment)
 
-    @inlined
-    def move_on(self, env: Any) -> None:
-        """Only the number changes."""
-        env.obs = env.new_obs
-
 
 class StateVectors(NamedTuple):
     """Observations are vectors, one for each state of a known model."""
@@ -103,11 +93,6 @@ class StateVectors(NamedTuple):
         vector = self.table[number_at(env, moment)]
         for j in range(len(row)):
             row[j] = vector[j]
-
-    @inlined
-    def move_on(self, env: Any) -> None:
-        """Only the number changes."""
-        env.obs = env.new_obs
 
 
 class OwnVectors(NamedTuple):
@@ -178,13 +163,7 @@ VECTOR_STATES: dict[type, tuple[str, ...]] = {CartPole: STATE, MountainCar: CAR_
 
 
 class EnvStates:
-    """Environments, with a record for each of them.
-
-    Args:
-        vec_env: the environments.
-        world: their compiled counterpart.
-        seen: how to read its observations.
-    """
+    """Environments, with a record for each; ``seen`` reads observations of the compiled world."""
 
     def __init__(self, vec_env: DummyVecEnv, world: Any, seen: Any) -> None:
         self.vec_env = vec_env

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from operator import attrgetter
 from typing import Any, ClassVar, Literal, cast
 
@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
 from rl_yardstick.agents.common.exploration import EPSILON_GREEDY
-from rl_yardstick.agents.common.schedules import ScheduleRow, schedule_row
+from rl_yardstick.agents.common.schedules import ScheduleRow, epsilon_schedule, schedule_row
 from rl_yardstick.agents.common.settings import (
     NOT_NEGATIVE,
     SAMPLE_AVERAGE,
@@ -63,6 +63,8 @@ class LearningAlgorithm(OnlineAlgorithm):
     # The algorithm's own arrays for compiled functions.
     _memory: tuple[Any, ...] = ()
     _read_settings: ClassVar[Any]
+    # Makes the arrays of compiled functions for a generator and a number of environments.
+    _make_workspace: ClassVar[Callable[..., Any]]
 
     hidden_arguments: ClassVar[tuple[str, ...]] = ("supported_action_spaces",)
 
@@ -106,7 +108,8 @@ class LearningAlgorithm(OnlineAlgorithm):
 
     def _policy_arguments(self) -> dict[str, Any]:
         """The policy's arguments besides spaces and schedule."""
-        return self.policy_kwargs
+        sizes = {name: getattr(self, name) for name in getattr(self.policy_class, "sizes", ())}
+        return {**sizes, **self.policy_kwargs}
 
     def _make_policy(self) -> BasePolicy:
         """Make the untrained policy."""
@@ -115,8 +118,8 @@ class LearningAlgorithm(OnlineAlgorithm):
         )
 
     def _make_exploration_schedule(self) -> Schedule:
-        """Make the schedule of the exploration rate."""
-        return FloatSchedule(0.0)
+        """Make the schedule of the exploration rate: of epsilon, for agents that have one."""
+        return epsilon_schedule(self) if hasattr(self, "exploration_decay") else FloatSchedule(0.0)
 
     @property
     def tie_scale(self) -> float:
@@ -140,10 +143,6 @@ class LearningAlgorithm(OnlineAlgorithm):
 
     def check_compilable(self) -> None:
         """Raise `NotCompilable` if the training needs something that compiled functions lack."""
-
-    def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
-        """Make the arrays of compiled functions for ``n`` environments and ``rng``."""
-        return None
 
     def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:
         """The inputs of a workspace: once they differ, the workspace is out of date.

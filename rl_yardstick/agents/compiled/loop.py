@@ -41,17 +41,13 @@ class CompiledOnlyError(TypeError):
     """A function of `by_type` was called from Python; it exists in compiled code only."""
 
 
-def by_type(stub: Function) -> Function:
-    """Make a compiled function that calls the function of that name of its first argument."""
-    return _dispatched(stub, None)
-
-
 def by_type_or_this(stub: Function) -> Function:
     """As `by_type`; the function itself serves the classes that have none of that name."""
-    return _dispatched(stub, stub)
+    return by_type(stub, stub)
 
 
-def _dispatched(stub: Function, default: Function | None) -> Function:
+def by_type(stub: Function, default: Function | None = None) -> Function:
+    """Make a compiled function that calls the function of that name of its first argument."""
     if IS_INTERPRETED:
         raise RuntimeError("agents need Numba's compiler: unset NUMBA_DISABLE_JIT")
     name = stub.__name__
@@ -145,9 +141,17 @@ def act(agent: Any, env: Any, progress: Any) -> None:
     """Choose ``env.action`` for ``env.obs``."""
 
 
-@by_type
+@by_type_or_this
+def move_on(seen: Any, env: Any) -> None:
+    """Make the new observation the one that the next action is chosen for."""
+    env.obs = env.new_obs
+
+
+@by_type_or_this
 def learn_from_step(agent: Any, envs: Any, progress: Any) -> None:
-    """Learn from the step that all environments have taken, and go on to the next observations."""
+    """Learn from the step of all environments, and move on to the next observations."""
+    for i in range(len(envs)):
+        move_on(agent.seen, envs[i])
 
 
 @by_type

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.type_aliases import Schedule
 
 from rl_yardstick.agents.common.exploration import (
     EPSILON_GREEDY,
@@ -13,10 +12,9 @@ from rl_yardstick.agents.common.exploration import (
     greedy_action,
     highest_value,
 )
-from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import EPSILONS, FINITE, ExplorationDecay
-from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
+from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this, move_on
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.agents.linear.algorithm import (
@@ -128,9 +126,6 @@ class SemiGradientAlgorithm(TileAlgorithm):
 
     def _initial_sums(self) -> Floats:
         return np.full(self.n_actions, float(self.initial_q))
-
-    def _make_exploration_schedule(self) -> Schedule:
-        return epsilon_schedule(self)
 
     def _probabilities(self, sums: Floats) -> Floats:
         ties = self.tie_breaking == "random"

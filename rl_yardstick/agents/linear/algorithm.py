@@ -27,7 +27,7 @@ from rl_yardstick.agents.common.settings import (
     whole,
 )
 from rl_yardstick.agents.compiled.engine import EngineChoice
-from rl_yardstick.agents.compiled.env_states import BEFORE, move_on, observe
+from rl_yardstick.agents.compiled.env_states import BEFORE, observe
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.compiled.references import handles_of
 from rl_yardstick.agents.compiled.worlds import UNDECIDED, env_dtype
@@ -237,10 +237,6 @@ class HandedVectors(NamedTuple):
         for j in range(len(row)):
             row[j] = self.before[env.number, j] if moment == BEFORE else self.after[env.number, j]
 
-    @called
-    def move_on(self, env: Any) -> None:
-        """Do nothing: the interpreted loop moves on by itself."""
-
 
 @by_type
 def choose_by_sums(agent: LinearAgent, progress: Any) -> int:
@@ -297,6 +293,7 @@ class TilePolicy(TablePolicy):
 
     weights: th.Tensor  # of action values or preferences, float64 of shape (tiles, A)
     state_weights: th.Tensor  # of state values, float64 of shape (tiles,), or (0,) without them
+    sizes = ("tiling", "values_states")
 
     def __init__(
         self,
@@ -306,16 +303,13 @@ class TilePolicy(TablePolicy):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self.tiling = dict(tiling or {})
+        self.tiling, self.values_states = dict(tiling or {}), values_states
         n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
         self.tiles = make_tiles(self.observation_space, **self.tiling, n_actions=n_actions)
         n_tiles = self.tiles.n_tiles
         self.register_buffer("weights", th.zeros((n_tiles, n_actions), dtype=th.float64))
         n_valued = n_tiles if values_states else 0
         self.register_buffer("state_weights", th.zeros(n_valued, dtype=th.float64))
-
-    def _sizes(self) -> dict[str, Any]:
-        return {"tiling": self.tiling, "values_states": len(self.state_weights) > 0}
 
     def sums(self, observations: NDArray[Any]) -> Floats:
         """Action values or preferences at n observations, shape (n, A)."""
@@ -326,11 +320,8 @@ class TilePolicy(TablePolicy):
             sums += weights[tiles]
         return sums
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         """The first of the best actions for each observation, shape (n,)."""
-        assert isinstance(observation, th.Tensor)
         return th.from_numpy(self.sums(observation.numpy()).argmax(axis=1))
 
 
@@ -376,12 +367,6 @@ class TilePlayer(NamedTuple):
         look(self, env, BEFORE, self.room.tiles)
         add_up(self, self.room.tiles)
         env.action = first_best(self.room.sums)
-
-    @called
-    def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Learn nothing; move on to the next observations."""
-        for i in range(len(envs)):
-            move_on(self.seen, envs[i])
 
 
 class TileAlgorithm(WorkspaceAlgorithm):

@@ -15,7 +15,8 @@ from rl_yardstick.agents.common.exploration import (
     make_probabilities,
 )
 from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE
-from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
+from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE
+from rl_yardstick.agents.compiled.loop import move_on
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.linear.algorithm import LinearAgent, TileAlgorithm, add_up, look
@@ -73,6 +74,7 @@ class SoftmaxAlgorithm(TileAlgorithm):
 
     parameters = {"gamma_power": np.bool_}  # noqa: RUF012
     choose_by_sums = draw_by_preference
+    _memory: Any
 
     hidden_arguments = ("tie_breaking",)
 
@@ -97,6 +99,9 @@ class SoftmaxAlgorithm(TileAlgorithm):
         for number in given.flat:
             FINITE.check("initial_preferences", float(number))
         return np.broadcast_to(given, self.n_actions)
+
+    def _memory_in_use(self) -> Any:
+        return self._memory._replace(values=self.policy.state_weights.numpy())
 
     def _probabilities(self, sums: Floats) -> Floats:
         return action_probabilities(BOLTZMANN, sums, 1.0, random_ties=False)
@@ -166,9 +171,6 @@ class ActorCritic(SoftmaxAlgorithm):
 
     def _make_memory(self) -> Critic:
         return Critic(self.policy.state_weights.numpy(), np.ones(self.n_envs))
-
-    def _memory_in_use(self) -> Critic:
-        return self._memory._replace(values=self.policy.state_weights.numpy())
 
 
 # REINFORCE, with and without a baseline.
@@ -287,9 +289,6 @@ class Reinforce(SoftmaxAlgorithm):
             np.zeros((n_envs, capacity), dtype=np.int64),
             np.zeros((n_envs, capacity)),
         )
-
-    def _memory_in_use(self) -> KeptEpisodes:
-        return self._memory._replace(values=self.policy.state_weights.numpy())
 
     def _keep_up_to(self, n_steps: int) -> None:
         """Enlarge the memory to ``n_steps`` steps of each episode, keeping stored steps."""

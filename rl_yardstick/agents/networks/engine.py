@@ -15,10 +15,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from torch import nn
 
-from rl_yardstick.agents.common.callbacks import EpisodeBudget, Horizon, horizon, members
+from rl_yardstick.agents.common.callbacks import Horizon, horizon
 from rl_yardstick.agents.common.exploration import first_best
 from rl_yardstick.agents.compiled.engine import CompiledEngine
-from rl_yardstick.agents.compiled.env_states import BEFORE, Numbers, look, move_on
+from rl_yardstick.agents.compiled.env_states import BEFORE, Numbers, look
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
 from rl_yardstick.agents.compiled.references import Reference, address_of, call, handles_of
 from rl_yardstick.agents.compiled.worlds import NotCompilable
@@ -247,16 +247,12 @@ class NetworkTraining:
         self.learner.hold(self.held)
 
     def read_tensors(self) -> None:
-        """Use weights that a callback may have replaced."""
-        self.trained.take_over()
-        self.lagging.take_over()
-
-    def read_actor(self) -> None:
         """Use the agent's generator and weights, which a callback may have replaced."""
         if self.agent.rng is not self.generator:
             self.generator = self.agent.rng
             self.held.rng[:] = handles_of([self.generator])
         self.trained.take_over()
+        self.lagging.take_over()
 
     def show(self, observations: Any) -> None:
         """Copy and check observations of environments in Python."""
@@ -371,20 +367,11 @@ class NetworkEngine(CompiledEngine):
         self.agent._last_obs = self.states.observations(self.envs, "")
         self.training.write()
 
-    def _read(self) -> None:
-        agent, progress = self.agent, self.progress[0]
-        progress["num_timesteps"] = agent.num_timesteps
-        progress["total_timesteps"] = self.total_timesteps
-        if self.training.goes_by_episodes:
-            progress["total_timesteps"] = agent._total_timesteps
-            for budget in members(self.callback):
-                if isinstance(budget, EpisodeBudget):
-                    progress["episode_budget"] = budget.n_episodes
-                    progress["budget_episodes"] = budget.episodes_seen
-        progress["remaining"] = agent._current_progress_remaining
+    def _read_agent(self) -> None:
+        if not self.training.goes_by_episodes:
+            self.progress["total_timesteps"] = self.total_timesteps
+            self.progress["episode_budget"] = 0
         self.training.read()
-        self.states.read()
-        self.states.take_observations(agent._last_obs)
 
 
 # The best output must be ahead by this share of the sum of magnitudes (ten times the rounding error
@@ -467,12 +454,6 @@ class NetworkPlayer(NamedTuple):
         """Take the best action."""
         look(self.seen, env, BEFORE, self.network.single, self.network.layers.one_hot)
         env.action = call(self.choose, self.network, 0.0, 0.0)
-
-    @inlined
-    def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Learn nothing; move on to the next observations."""
-        for i in range(len(envs)):
-            move_on(self.seen, envs[i])
 
     def check(self) -> None:
         """Raise the exception of the library's `predict`, if there was one."""

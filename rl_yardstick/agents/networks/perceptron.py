@@ -28,11 +28,7 @@ ir: Any = vars(cgutils)["ir"]  # llvmlite's, which comes with Numba
 AS_IT_IS = ord("N")
 TRANSPOSED = ord("T")
 
-
-@cache
-def _controller() -> ThreadpoolController:
-    # SciPy's BLAS is loaded by now, because `sgemm_address` has been called.
-    return ThreadpoolController()
+_controller = cache(ThreadpoolController)  # made when SciPy's BLAS is loaded
 
 
 def one_thread() -> AbstractContextManager[Any]:

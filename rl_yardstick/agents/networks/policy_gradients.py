@@ -19,16 +19,9 @@ from torch import nn
 
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.schedules import ScheduleRow, schedule_value
-from rl_yardstick.agents.compiled.env_states import (
-    AFTER,
-    BEFORE,
-    Numbers,
-    look,
-    move_on,
-    observe,
-    show,
-)
+from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, Numbers, look, observe, show
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
+from rl_yardstick.agents.compiled.loop import move_on
 from rl_yardstick.agents.compiled.references import (
     Reference,
     address_of,
@@ -614,7 +607,6 @@ class PolicyTraining(NetworkTraining):
 
     def read_settings(self) -> None:
         """Read settings that a callback may have changed."""
-        self.read_actor()
         self.read_tensors()
         self.held.rules[:] = self._rules(_bound)
 
@@ -738,7 +730,7 @@ class PolicyTraining(NetworkTraining):
         """Actions for the present observations, stored in the rollout with their values."""
         actions = np.zeros(self.agent.n_envs, np.int64)
         self.place["step"] = step
-        self.read_actor()
+        self.read_tensors()
         self.show(self.agent._last_obs)
         act_on_rows(self.learner, self.shown, actions)
         self.memory.held.observations[step] = self.shown

@@ -14,15 +14,8 @@ from stable_baselines3.common.utils import update_learning_rate
 
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.exploration import first_best
-from rl_yardstick.agents.compiled.env_states import (
-    AFTER,
-    BEFORE,
-    Numbers,
-    look,
-    move_on,
-    observe,
-    show,
-)
+from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, Numbers, look, observe, show
+from rl_yardstick.agents.compiled.loop import move_on
 from rl_yardstick.agents.compiled.references import (
     Reference,
     address_of,
@@ -508,7 +501,6 @@ class QTraining(NetworkTraining):
 
     def read_settings(self) -> None:
         """Read settings that a callback may have changed."""
-        self.read_actor()
         self.read_tensors()
         self.held.rules[:] = self._rules()
         env = self.agent.get_vec_normalize_env()
@@ -551,7 +543,7 @@ class QTraining(NetworkTraining):
     def act(self, learning_starts: int) -> Ints:
         """Actions for the agent's present observations, with environments in Python."""
         self.read()
-        self.read_actor()
+        self.read_tensors()
         self.held.rules["learning_starts"] = learning_starts
         self.show(self.agent._last_obs)
         actions = np.zeros(len(self.shown), np.int64)

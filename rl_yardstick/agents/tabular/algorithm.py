@@ -29,7 +29,6 @@ from rl_yardstick.agents.common.masks import (
     numbers_in,
     present_masks,
 )
-from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import (
     EPSILONS,
     POSITIVE,
@@ -64,16 +63,15 @@ class QTablePolicy(MaskBufferPolicy):
 
     q_tables: th.Tensor  # action values, float64 of shape (T, S, A)
     visit_counts: th.Tensor  # number of updates of each entry, int64 of shape (T, S, A)
+    sizes: ClassVar[tuple[str, ...]] = ("n_tables",)
 
     def __init__(self, *args: Any, n_tables: int = 1, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        sizes: Any = self.observation_space, self.action_space
-        shape = (n_tables, *(int(space.n) for space in sizes))
+        self.n_tables = n_tables
+        spaced: Any = self.observation_space, self.action_space
+        shape = (n_tables, *(int(space.n) for space in spaced))
         self.register_buffer("q_tables", th.zeros(shape, dtype=th.float64))
         self.register_buffer("visit_counts", th.zeros(shape, dtype=th.int64))
-
-    def _sizes(self) -> dict[str, Any]:
-        return {"n_tables": len(self.q_tables)}
 
     @property
     def q_table(self) -> Floats:
@@ -114,9 +112,7 @@ class QTablePolicy(MaskBufferPolicy):
         masks = self.masks[obs]
         return np.where(masks | ~masks.any(axis=1, keepdims=True), values, -np.inf)
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         """The first of the best allowed actions for each observation, shape (n,)."""
         obs = numbers_in(self.observation_space, observation).reshape(-1)
         return th.from_numpy(self.allowed_values(obs).argmax(axis=1))
@@ -259,9 +255,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
                 "give: take epsilon_greedy or boltzmann"
             )
 
-    def _policy_arguments(self) -> dict[str, Any]:
-        return {"n_tables": self.n_tables, **self.policy_kwargs}
-
     def _make_policy(self) -> BasePolicy:
         policy = cast(QTablePolicy, super()._make_policy())
         if self.mask_actions:
@@ -280,7 +273,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             return FloatSchedule(self.temperature)
         if self.exploration == "gaussian_noise":
             return FloatSchedule(self.noise_std)
-        return epsilon_schedule(self)
+        return super()._make_exploration_schedule()
 
     # Arguments of compiled functions.
 
@@ -303,7 +296,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
     def greedy_player(self, seen: Any) -> Plan:
         """A player with the greedy actions of `predict` on compiled environments."""
         numbers = np.arange(self.policy.q_tables.shape[1])
-        return Plan(self.predict(numbers, deterministic=True)[0].astype(np.int64))
+        return Plan(self.predict(numbers, deterministic=True)[0].astype(np.int64), seen)
 
     # Training.
 

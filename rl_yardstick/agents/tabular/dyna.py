@@ -61,6 +61,7 @@ class ModelPolicy(QTablePolicy):
     """Greedy in a table, with a learnt model of the environment beside it."""
 
     model_type: ClassVar[Any] = LearntModel  # the model's NamedTuple of arrays
+    sizes = (*QTablePolicy.sizes, "outcomes_kept")
 
     def __init__(self, *args: Any, outcomes_kept: int = 1, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -68,9 +69,6 @@ class ModelPolicy(QTablePolicy):
         n_states, n_actions = self.visit_counts.shape[1:]
         for name, array in self._nothing_learnt(n_states, n_actions, outcomes_kept).items():
             self.register_buffer(f"model_{name}", th.from_numpy(array))
-
-    def _sizes(self) -> dict[str, Any]:
-        return {**super()._sizes(), "outcomes_kept": self.outcomes_kept}
 
     def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
         """The arrays of an empty model, by name."""
@@ -130,9 +128,6 @@ class ModelKeeper(TabularAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": ModelPolicy}
     policy: ModelPolicy
     outcomes_kept: int = 1  # number of outcomes in the model for each pair of state and action
-
-    def _policy_arguments(self) -> dict[str, Any]:
-        return {**super()._policy_arguments(), "outcomes_kept": self.outcomes_kept}
 
     def _memory_in_use(self) -> Any:
         return self.policy.model

@@ -129,19 +129,12 @@ def value_where_cut_off(agent: TabularAgent, env: Any, progress: Any) -> float:
 
 
 @inlined
-def note_first_visits(agent: TabularAgent, i: int, length: int) -> None:
-    """Fill in the step of each entry's first visit in the episode."""
-    records = agent.memory
-    for k in range(length - 1, -1, -1):
-        records.of_entries[records.states[i, k], records.actions[i, k]] = k
-
-
-@inlined
 def learn_from_visits(agent: TabularAgent, env: Any, progress: Any, i: int, length: int) -> float:
     """Move each entry towards the return after its first visit, or after every visit."""
     records = agent.memory
     later = value_where_cut_off(agent, env, progress)
-    note_first_visits(agent, i, length)
+    for k in range(length - 1, -1, -1):  # the first visit is written last
+        records.of_entries[records.states[i, k], records.actions[i, k]] = k
     total_error, n_learnt = 0.0, 0
     for k in range(length - 1, -1, -1):
         state, action = records.states[i, k], records.actions[i, k]
@@ -189,13 +182,6 @@ def act_and_tell(agent: TabularAgent, env: Any, progress: Any) -> None:
 
 
 @inlined
-def is_first_best(agent: TabularAgent, state: int, action: int) -> bool:
-    """Whether the action is the one of `predict`."""
-    room = values_at(agent, state, 0)
-    return bool(place_of(agent, room, action) == greedy_action(room.values, 0.0))
-
-
-@inlined
 def learn_by_importance(agent: TabularAgent, env: Any, progress: Any, i: int, length: int) -> float:
     """Weigh returns by importance sampling ratios of the greedy to the exploring policy."""
     records, values, weight = agent.memory, agent.tables.values, 1.0
@@ -210,7 +196,9 @@ def learn_by_importance(agent: TabularAgent, env: Any, progress: Any, i: int, le
         values[0, state, action] += weight / records.of_entries[0, state, action] * error
         total_error += abs(error)
         n_learnt += 1
-        if records.probabilities[i, k] <= 0.0 or not is_first_best(agent, state, action):
+        room = values_at(agent, state, 0)
+        is_greedy = place_of(agent, room, action) == greedy_action(room.values, 0.0)
+        if records.probabilities[i, k] <= 0.0 or not is_greedy:
             break
         weight /= records.probabilities[i, k]
         if weight > LARGEST_WEIGHT:

@@ -75,7 +75,7 @@ class Bandit(BarsEnv):
     def _bars(self) -> Bars:
         """A bar for each arm up to its observed mean, marked at its true mean."""
         means = self._sums / np.maximum(self._counts, 1)
-        true, present = self._true_means(), self._row(self.context)
+        true, present = self._true_means(), int(self.context) if self.n_contexts else 0
         n_arms = min(self.n_arms, MAX_SHOWN)
         n_contexts = min(MAX_SHOWN // n_arms, len(means))
         first = max(0, min(present - n_contexts // 2, len(means) - n_contexts))
@@ -108,14 +108,10 @@ class Bandit(BarsEnv):
             raise ValueError(f"arm {arm} does not exist: they are numbered 0 to {self.n_arms - 1}")
         return arm
 
-    def _row(self, context: Any) -> int:
-        """The row of the counts for a context: its own, or the only one."""
-        return int(context) if self.n_contexts else 0
-
     def _show_pull(self, context: Any, arm: int, reward: float) -> None:
         """Record a pull for the next picture, and render it in mode ``human``."""
         if self.render_mode is not None:
-            self._last = at = self._row(context), arm, reward
+            self._last = at = int(context) if self.n_contexts else 0, arm, reward
             self._counts[at[:2]] += 1
             self._sums[at[:2]] += reward
         if self.render_mode == "human":

@@ -84,7 +84,7 @@ class LinearBandit(StochasticBandit):
         self.n_features = shape[1]
         space = spaces.Box(-1, 1, (self.n_features,), np.float32)
         super().__init__(shape[0], space, pulls=pulls, render_mode=render_mode)
-        self._see(np.zeros(self.n_features, np.float32))
+        self._see(np.full(self.n_features, 0.5))  # the context 0
 
     def expected_rewards(self) -> list[float]:
         return self._expected
@@ -93,18 +93,16 @@ class LinearBandit(StochasticBandit):
         if self.redraws:
             normals = self.np_random.standard_normal(self.arm_parameters.shape)
             self.arm_parameters = normals * math.sqrt(3 / self.n_features)
-        self._see(self._next_context())
+        self._see(self.np_random.random(self.n_features))
 
     def _pull(self, arm: int) -> float:
         reward = self._expected[arm] + self.reward_std * self.np_random.standard_normal()
-        self._see(self._next_context())
+        self._see(self.np_random.random(self.n_features))
         return reward
 
-    def _next_context(self) -> NDArray[np.float32]:
-        return (2 * self.np_random.random(self.n_features) - 1).astype(np.float32)
-
-    def _see(self, context: NDArray[np.float32]) -> None:
-        self.context = context
+    def _see(self, uniforms: NDArray[np.float64]) -> None:
+        """Set the context by numbers in [0, 1), shape (n_features,)."""
+        self.context = context = (2 * uniforms - 1).astype(np.float32)
         # A cumulative sum adds in a fixed order, a matrix product in one that depends on the
         # machine: compiled copies could not repeat it to the last bit.
         sums = np.cumsum(self.arm_parameters * context, axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -118,6 +118,7 @@ class RacetrackEnv(MapEnv):
         self.noise = check_number("noise", noise, 0, 1)
         self.step_reward = check_number("step_reward", step_reward)
         self.rows = TRACKS[self.track]
+        self._cells = _cells_of(self.rows)
         super().__init__(len(self._cells) * N_SPEEDS**2, 9, render_mode)
 
     def transition_model(self) -> TransitionModel:
@@ -126,10 +127,6 @@ class RacetrackEnv(MapEnv):
     def cell_of(self, state: int) -> int:
         """Where the car is, cells of the map counted row by row."""
         return int(self._cells[state // N_SPEEDS**2])
-
-    @cached_property
-    def _cells(self) -> Ints:
-        return _cells_of(self.rows)
 
 
 def crossed_cells(up: int, right: int) -> list[tuple[int, int]]:

@@ -75,12 +75,10 @@ def rounded(number: float) -> float | None:
 
 def as_json(value: Any, of_float: Callable[[float], Any] = rounded) -> str:
     """Compact JSON of a value, also of arrays and dataclasses, with its floats by ``of_float``."""
-
-    def read(text: str) -> Any:
-        return of_float(float(text))
-
     text = json.dumps(value, default=lambda one: vars(one) if is_dataclass(one) else one.tolist())
-    value = json.loads(text, parse_float=read, parse_constant=read)
+    names = ("parse_float", "parse_constant")
+    read: Any = dict.fromkeys(names, lambda found: of_float(float(found)))
+    value = json.loads(text, **read)
     return json.dumps(value, separators=(",", ":"), allow_nan=False)
 
 

@@ -18,9 +18,9 @@ from rl_yardstick.envs.layout import GridLayout, grid_layout
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.pool import do_aside
-from rl_yardstick.experiments.results import read_compared, read_value_maps
+from rl_yardstick.experiments.results import read_compared
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.pipeline.files import read_bytes, read_json
+from rl_yardstick.pipeline.files import read_arrays, read_bytes, read_json
 from rl_yardstick.pipeline.run import MEANINGS
 from rl_yardstick.report.films import films_of, has_film
 from rl_yardstick.report.page.frame import Report, Section, data_uri, first_runs, layout_data
@@ -148,6 +148,13 @@ def _compared(
 
 MAX_MAPS = 40  # of a run: more than a slider needs
 MIN_MAPS = 2  # the first and the last
+MAPS = {
+    "timesteps": "n",
+    "values": "n states",
+    "actions": "n states",
+    "optimal_values": "states",
+    "optimal_actions": "states choices",
+}
 # The most values and actions on a page, shared by its environments; each takes 4 bytes.
 MAX_FIGURES = 200_000
 
@@ -216,7 +223,7 @@ def _read_maps(
     maps: dict[tuple[str, int], Arrays] = {}
     figures = 0
     for run in runs:
-        arrays = read_value_maps(run.path)
+        arrays = read_arrays(run.path / "value_maps.npz", MAPS)
         n = len(arrays["timesteps"])
         if n > n_maps:  # the first and the last among them
             kept = np.linspace(0, n - 1, n_maps).round().astype(np.int64)
