@@ -22,7 +22,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
-from rl_yardstick.agents.tabular.n_step import QLearning
+from rl_yardstick.agents.tabular.q_learning_and_sarsa import QLearning
 from rl_yardstick.envs.known_models import time_limit, transition_model
 from rl_yardstick.envs.warehouse import DEFAULT_MAP
 from rl_yardstick.envs.wrappers import DiscretizeObservation

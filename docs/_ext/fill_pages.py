@@ -2,7 +2,7 @@
 
 A page requests a block by a link with a title, which a code host shows as a link::
 
-    [The code](../../rl_yardstick/agents/tabular/n_step.py "code: best_next_value QLearning")
+    [The code](../../rl_yardstick/agents/tabular/dyna.py "code: DynaQ")
 
 The kinds of blocks: ``code``, with names that the linked file defines; ``environment``, with an id
 and arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, with the

@@ -23,8 +23,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.envs.wrappers import FlattenToDiscrete
 from rl_yardstick.mdp.evaluation import policy_return
+from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
 from rl_yardstick.mdp.graph import PolicyChain
-from rl_yardstick.mdp.large_maps import finite_horizon_optimum
 from rl_yardstick.mdp.transition_model import Floats, Ints, TransitionModel
 
 FEW, MANY = 10_000, 500_000

@@ -21,9 +21,9 @@ from torch.nn.functional import mse_loss
 from torch.nn.utils import clip_grad_norm_
 
 from rl_yardstick.agents.common.masks import check_masks_exist, checked_masks, present_masks
+from rl_yardstick.agents.networks.dqn import CompiledQLearning
 from rl_yardstick.agents.networks.engine_setting import NetworkEngineChoice
 from rl_yardstick.agents.networks.policy_gradients import CompiledPolicyGradient
-from rl_yardstick.agents.networks.q_learning import CompiledQLearning
 from rl_yardstick.envs.wrappers import INFO_KEY
 from rl_yardstick.mdp.transition_model import Bools
 

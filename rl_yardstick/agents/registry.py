@@ -151,10 +151,12 @@ _mabwiser = _family(
 
 
 ALGORITHMS: dict[str, AlgorithmEntry] = {
-    "qlearning": _tabular("n_step:QLearning", "Q-learning on a table"),
-    "sarsa": _tabular("n_step:SARSA", "SARSA on a table"),
-    "expected_sarsa": _tabular("n_step:ExpectedSARSA", "Expected SARSA on a table"),
-    "double_qlearning": _tabular("n_step:DoubleQLearning", "double Q-learning on two tables"),
+    "qlearning": _tabular("q_learning_and_sarsa:QLearning", "Q-learning on a table"),
+    "sarsa": _tabular("q_learning_and_sarsa:SARSA", "SARSA on a table"),
+    "expected_sarsa": _tabular("q_learning_and_sarsa:ExpectedSARSA", "Expected SARSA on a table"),
+    "double_qlearning": _tabular(
+        "q_learning_and_sarsa:DoubleQLearning", "double Q-learning on two tables"
+    ),
     "n_step_sarsa": _tabular("n_step:NStepSARSA", "n-step SARSA on a table"),
     "n_step_tree_backup": _tabular("n_step:NStepTreeBackup", "n-step tree backup on a table"),
     "sarsa_lambda": _tabular("n_step:SARSALambda", "SARSA(lambda): traces on a table"),

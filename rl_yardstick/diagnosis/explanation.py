@@ -156,12 +156,9 @@ class Task(NamedTuple):
 
 
 def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> Explanation:
-    """Explain where an agent loses return to the optimum.
+    """Explain where an agent's greedy policy loses return to the optimum.
 
-    Args:
-        spec: the spec of the agent's run.
-        agent: the agent, whose greedy policy is explained.
-        evaluator: the result of `exact_evaluator` for the spec.
+    ``evaluator`` is the result of `exact_evaluator` for the spec of its run.
 
     Raises:
         UserError: where the agent's policy cannot be evaluated in all states, or the environment is

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
         state_values,
         state_visitation,
     )
+    from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum, optimum_far_from_limit
     from rl_yardstick.mdp.hardness import Hardness, hardness_of
-    from rl_yardstick.mdp.large_maps import finite_horizon_optimum, optimum_far_from_limit
     from rl_yardstick.mdp.planning import Plan, policy_iteration, value_iteration
 
 __all__ = [
@@ -47,7 +47,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    for home in ("planning", "evaluation", "large_maps", "hardness") if name in __all__ else ():
+    for home in ("planning", "evaluation", "finite_horizon", "hardness") if name in __all__ else ():
         module = importlib.import_module(f"rl_yardstick.mdp.{home}")
         if hasattr(module, name):
             return getattr(module, name)

@@ -15,8 +15,8 @@ import numpy as np
 
 from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.evaluation import Policy, canonical_policy, chances_in, policy_return
+from rl_yardstick.mdp.finite_horizon import back_up
 from rl_yardstick.mdp.graph import PolicyChain
-from rl_yardstick.mdp.large_maps import back_up
 from rl_yardstick.mdp.planning import action_value
 from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 

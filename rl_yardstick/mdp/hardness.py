@@ -20,8 +20,8 @@ from rl_yardstick.mdp.evaluation import (
     policy_return,
     state_visitation,
 )
+from rl_yardstick.mdp.finite_horizon import FiniteHorizonPlan, back_up, finite_horizon_optimum
 from rl_yardstick.mdp.graph import steps_to_end
-from rl_yardstick.mdp.large_maps import FiniteHorizonPlan, back_up, finite_horizon_optimum
 from rl_yardstick.mdp.planning import action_value, policy_iteration, surely_ending
 from rl_yardstick.mdp.transition_model import AnyInts, Bools, Dynamics, Floats, TransitionModel
 

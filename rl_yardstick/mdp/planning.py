@@ -1,7 +1,7 @@
 """The best policy of a finite Markov decision process, and its values.
 
 Without a time limit some best policy is stationary; for planning under a time limit, see
-``mdp.large_maps``.
+``mdp.finite_horizon``.
 
 Without discount, the sum of rewards until the episode ends is a stochastic shortest path problem
 (Bertsekas and Tsitsiklis, An Analysis of Stochastic Shortest Path Problems, 1991). It has a finite

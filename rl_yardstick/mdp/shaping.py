@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rl_yardstick.mdp.large_maps import finite_horizon_optimum
+from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
 from rl_yardstick.mdp.planning import Plan, policy_iteration
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints, TransitionModel
 

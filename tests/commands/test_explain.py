@@ -106,7 +106,8 @@ def test_a_script_of_ones_own(type_command, tmp_path):
 
 
 def test_a_class_of_ones_own(type_command, tmp_path, monkeypatch):
-    text = "from rl_yardstick.agents.tabular.n_step import QLearning\n\nMine = QLearning\n"
+    module = "rl_yardstick.agents.tabular.q_learning_and_sarsa"
+    text = f"from {module} import QLearning\n\nMine = QLearning\n"
     (tmp_path / "my_audited_agents.py").write_text(text)
     words = ("--engine", "interpreted")
     few = (target_probes.probe_ends, target_probes.probe_discount)

@@ -79,7 +79,7 @@ def test_a_changed_rule_in_another_file_is_what_runs(checkout):
 
 OWN_RULE = """
 from rl_yardstick.machine_code.compiling import inlined
-from rl_yardstick.agents.tabular.n_step import QLearning
+from rl_yardstick.agents.tabular.q_learning_and_sarsa import QLearning
 WORTH = {worth}
 
 @inlined

@@ -14,7 +14,7 @@ from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
-from rl_yardstick.agents.tabular.n_step import QLearning
+from rl_yardstick.agents.tabular.q_learning_and_sarsa import QLearning
 from rl_yardstick.agents.tabular.updates import TabularAgent, action_at, best_value, room_at, update
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
