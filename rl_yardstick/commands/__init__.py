@@ -55,6 +55,9 @@ def run_command(name: str) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="plain")
+    leave, own = os._exit, os.getpid()
+    # Until the work is done nothing ends this process with 0, such as os._exit in an environment.
+    os._exit = lambda status: leave(status or int(os.getpid() == own))
     code = _exit_code(name)
     with suppress(OSError):
         sys.stdout.flush()

@@ -284,6 +284,8 @@ def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
         for environment, record in records.items():
             if refusal := record.get("model_refused"):
                 tell(f"{environment}: {refusal}; figures are sampled")
+            for note in record.get("notes", ()):
+                tell(f"{environment}: {note}")
         if note := mixed_versions(run.recorded() for run in results.finished):
             tell(note)
     for one in results.left_out:

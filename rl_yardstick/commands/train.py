@@ -46,7 +46,7 @@ examples:
 FLAGS: Flags = {
     "": (
         flag("--algo", "agent (default: ppo; see --list)", default="ppo"),
-        flag("--env", "environment id (default: CartPole-v1; see --list)", default="CartPole-v1"),
+        flag("--env", "environment id (default: CartPole-v1; see --list)"),
         switch("--list", "list agents and environments, and which fit which"),
     ),
     "budget and settings": (
@@ -101,6 +101,10 @@ def main() -> int:
 
     stop = Stop().listen()
     console = TextConsole(quiet=args.verbose < 1, force_terminal=args.progress or None)
+    if args.env is None:
+        args.env = "CartPole-v1"
+        if args.resume is None:
+            console.print("no --env is given: CartPole-v1", style="dim", highlight=False)
     if args.resume is not None:
         return resume(Run(unfinished_run(args), console, stop), args)
     spec = spec_from_flags(args)
@@ -397,7 +401,8 @@ def print_lists() -> None:
     told = "agents with hyperparameters for it; also: those that take the default ones"
     places: list[tuple[str, str]] = [("environment (--env)", told)]
     tuned = {name: set(entry_names(name)) for name in ALGORITHMS}
-    for env_id in sorted(set().union(*tuned.values()) & set(gym.registry)):
+    own = {one.id for one in gym.registry.values() if "rl_yardstick" in str(one.entry_point)}
+    for env_id in sorted(own | set().union(*tuned.values()) & set(gym.registry)):
         with closing(make_env(env_id, {})) as env:
             spaces = env.observation_space, env.action_space
             fitting = fitting_algorithms(*spaces, is_bandit(env), has_masks(env))

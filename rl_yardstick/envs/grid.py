@@ -160,7 +160,7 @@ def read_rows(desc: Description) -> tuple[str, ...]:
             f"desc must be a list of rows, such as ['S.', '#G'], or the path to a text file, not "
             f"{desc!r}"
         )
-    return tuple(text.strip("\r\n").splitlines())
+    return tuple(row.rstrip() for row in text.strip("\r\n").splitlines())
 
 
 def _is_path(desc: Description) -> TypeGuard[str | os.PathLike[str]]:

@@ -183,12 +183,28 @@ class TerminationReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return obs, reward, terminated, truncated, info
 
 
+class WithoutEpisodeInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Leaves out ``info["episode"]`` of an environment, because Monitor's has this name."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(**kwargs)
+        return obs, {key: value for key, value in info.items() if key != "episode"}
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        *found, info = self.env.step(action)
+        return *found, {key: value for key, value in info.items() if key != "episode"}
+
+
 class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
     """Turns an observation of several whole numbers into one, the last number counting fastest.
 
     Args:
-        env: an environment whose observations are MultiDiscrete, a Tuple of Discrete, or a
-            Discrete, which is counted from zero afterwards.
+        env: an environment whose observations are MultiDiscrete, a Tuple or Dict of Discrete, or
+            a Discrete, which is counted from zero afterwards.
 
     Raises:
         ValueError: if the observations are none of these.
@@ -198,7 +214,12 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
         RecordConstructorArgs.__init__(self)
         gym.ObservationWrapper.__init__(self, env)
         space = env.observation_space
-        parts = space.spaces if isinstance(space, spaces.Tuple) else [space]
+        parts: list[Any] = [space]
+        if isinstance(space, spaces.Dict):
+            parts = list(space.spaces.values())
+        elif isinstance(space, spaces.Tuple):
+            parts = list(space.spaces)
+        self._keys = list(space.spaces) if isinstance(space, spaces.Dict) else None
         discrete = [part for part in parts if isinstance(part, spaces.Discrete)]
         if isinstance(space, spaces.MultiDiscrete):
             self._sizes, self._first = space.nvec.ravel().tolist(), space.start.ravel().tolist()
@@ -207,8 +228,8 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
             self._first = [int(part.start) for part in discrete]
         else:
             raise ValueError(
-                "FlattenToDiscrete needs MultiDiscrete, a Tuple of Discrete, or Discrete, not "
-                f"{space}"
+                "FlattenToDiscrete needs MultiDiscrete, a Tuple or Dict of Discrete, or Discrete, "
+                f"not {space}"
             )
         self.observation_space = spaces.Discrete(math.prod(self._sizes))
 
@@ -216,6 +237,8 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
         """The number of one observation."""
         if isinstance(observation, np.ndarray):
             observation = observation.ravel().tolist()
+        elif self._keys is not None:
+            observation = [observation[key] for key in self._keys]
         index = 0
         values = observation if isinstance(observation, Sequence) else [observation]
         for value, size, first in zip(values, self._sizes, self._first, strict=True):
@@ -248,7 +271,7 @@ class OneHotObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         gym.ObservationWrapper.__init__(self, env)
-        space = env.observation_space
+        space: Any = env.observation_space
         if not isinstance(space, spaces.Discrete):
             raise ValueError(f"OneHotObservation needs Discrete observations, not {space}")
         self._first = int(space.start)

@@ -11,6 +11,7 @@ transitions enter are never used.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -30,6 +31,7 @@ AnyInts = NDArray[np.integer]
 Dynamics = tuple[Floats, AnyInts, Bools, Floats]
 
 PROBABILITY_TOLERANCE = 1e-9
+SINGLE_PRECISION = 1e-6  # the error of sums of probabilities in single precision
 
 Outcomes = Sequence[tuple[float, int, float, bool]]
 
@@ -91,9 +93,14 @@ class TransitionModel:
 
         Raises:
             ValueError: as the constructor, and where states have different numbers of actions
-                or a state and action has no outcome.
+                or an outcome does not have these four parts. Probabilities in single precision,
+                which sum to one within 1e-6, are scaled.
         """
         n_states = len(P)
+        if not isinstance(P.get(0), Mapping):
+            first = next(iter(P.items()), "nothing")
+            wanted = f"P must map states, the numbers 0 to {n_states - 1}, to mappings of actions"
+            raise ValueError(f"{wanted}; it begins with {reprlib.repr(first)}")
         n_actions = len(P[0])
         rows = [_row(P, state, action) for state in range(n_states) for action in range(n_actions)]
         lengths = np.array([len(row) for row in rows])
@@ -106,8 +113,12 @@ class TransitionModel:
             padded[filled] = [outcome[position] for outcome in flat]
             return padded.reshape(n_states, n_actions, n_outcomes)
 
+        prob = column(0, np.float64)
+        total = prob.sum(axis=2, keepdims=True)
+        if np.abs(total - 1).max() < SINGLE_PRECISION:  # an exact sum stays as it is
+            prob /= total
         return cls(
-            prob=column(0, np.float64),
+            prob=prob,
             next_state=column(1, np.int64),
             reward=column(2, np.float64),
             terminated=column(3, np.bool_),
@@ -214,6 +225,12 @@ def _row(P: Mapping[int, Mapping[int, Outcomes]], state: int, action: int) -> Ou
         raise ValueError(f"state {state} must have the actions 0 to {len(P[0]) - 1} in P")
     if not P[state][action]:
         raise ValueError(f"state {state}, action {action} has no outcome in P")
+    outcomes: Any = P[state][action]
+    for outcome in outcomes:
+        if len(outcome) != 4:
+            form = "(probability, next state, reward, terminated)"
+            found = f"an outcome is {form}, not {reprlib.repr(outcome)}"
+            raise ValueError(f"state {state}, action {action}: {found}")
     return P[state][action]
 
 

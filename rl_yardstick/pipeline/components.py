@@ -10,6 +10,7 @@ Importing an agent takes two seconds, for torch. So the signatures of the regist
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import inspect
 import json
@@ -87,6 +88,17 @@ def _import_file(path: Path) -> None:
 def module_name(typed: str) -> str:
     """The name under which `import_modules` has imported what was typed."""
     return Path(typed).stem if typed.endswith(".py") or "/" in typed else typed
+
+
+def digests_of(typed: Iterable[str]) -> dict[str, str]:
+    """A digest of the sources of each imported module of the user, by its name."""
+    found = {}
+    for name in map(module_name, typed):
+        file = Path(getattr(sys.modules.get(name), "__file__", None) or "")
+        files = sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
+        sources = b"".join(one.read_bytes() for one in files if one.is_file())
+        found[name] = hashlib.sha256(sources).hexdigest()[:12]
+    return found
 
 
 def split_id(env_id: str) -> tuple[str, str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+import shlex
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,12 @@ from gymnasium.envs.registration import load_env_creator
 
 import rl_yardstick.envs  # noqa: F401  # registers this project's environments
 from rl_yardstick.agents.registry import ALGORITHMS, fitting_algorithms, is_bandit
-from rl_yardstick.envs.wrappers import ActionMasks, has_masks
+from rl_yardstick.envs.wrappers import (
+    ActionMasks,
+    DiscretizeObservation,
+    FlattenToDiscrete,
+    has_masks,
+)
 from rl_yardstick.pipeline.components import build, import_modules, split_id
 from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -21,6 +27,7 @@ from rl_yardstick.pipeline.spec import TrainSpec
 # The time limit of evaluations if neither environment nor settings have one: a greedy policy that
 # moves in a circle would never end an episode.
 EVALUATION_TIME_LIMIT = 1000
+MOST_BOXES = 1_000_000  # of a vector cut into bins
 MISTAKES = (
     *(TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError),
     *(OSError, ImportError, MemoryError, gym.error.Error),
@@ -34,6 +41,8 @@ def check_env_id(env_id: str) -> None:
     module, name = split_id(env_id)
     if module:
         raise UserError(f"{env_id}: name it {name}, and add --gym-packages {module}")
+    if env_id not in gym.registry and env_id.startswith("ALE/"):
+        raise UserError(f"{env_id}: pip install ale-py, and add --gym-packages ale_py")
     if env_id not in gym.registry:
         raise unknown("unknown environment", env_id, gym.registry, n=3)
 
@@ -61,11 +70,11 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> Env:
 def _parameters(env_id: str) -> Mapping[str, inspect.Parameter]:
     """The arguments of the class or function that makes an environment."""
     with suppress(ImportError, AttributeError, TypeError, ValueError):
-        return inspect.signature(_creator(env_id)).parameters
+        return inspect.signature(creator_of(env_id)).parameters
     return {}
 
 
-def _creator(env_id: str) -> Any:
+def creator_of(env_id: str) -> Any:
     """The class or function that makes an environment."""
     entry_point = gym.spec(env_id).entry_point
     return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
@@ -137,8 +146,28 @@ def check_fit(spec: TrainSpec) -> None:
         if misfit := ALGORITHMS[spec.algo].env_misfit(env):
             spaces = env.observation_space, env.action_space
             fitting = fitting_algorithms(*spaces, is_bandit(env), has_masks(env))
-            others = f"fitting agents: {', '.join(fitting)}" if fitting else "no agent here fits"
+            ways = [f"fitting agents: {', '.join(fitting)}"] if fitting else []
+            ways += [f"or add {flag}" for flag in _fitting_wrappers(spec, env)]
+            others = "; ".join(ways) or "no agent here fits"
             raise UserError(f"{spec.algo} does not fit {spec.env_id}: {misfit}; {others}")
+
+
+def _fitting_wrappers(spec: TrainSpec, env: Env) -> Iterator[str]:
+    """The flag for each shipped wrapper around which the agent fits."""
+    space = env.observation_space
+    bins: dict[str, Any] = {"bins": 10}
+    if isinstance(space, gym.spaces.Box) and not space.is_bounded():
+        bins |= {"low": -3.0, "high": 3.0}
+    for kind, kwargs in ((FlattenToDiscrete, {}), (DiscretizeObservation, bins)):
+        with suppress(ValueError):
+            wrapped: Any = kind(env, **kwargs)
+            n = wrapped.observation_space.n
+            if n > MOST_BOXES or ALGORITHMS[spec.algo].env_misfit(wrapped):
+                continue
+            name = f"{kind.__module__}.{kind.__name__}"
+            words = ", ".join(f"{key}: {value}" for key, value in kwargs.items())
+            typed = f"env_wrapper:{{{name}: {{{words}}}}}" if kwargs else f"env_wrapper:{name}"
+            yield f"-params {shlex.quote(typed)}"
 
 
 # --- making them ----------------------------------------------------------------------------------
@@ -244,6 +273,8 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
     So a run does not depend on the folder in which it was started.
     """
+    from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+
     from rl_yardstick.envs.bandits.logged import ReplayBandit
     from rl_yardstick.envs.grid import GridWorld, read_rows
 
@@ -251,7 +282,7 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
         kwargs: Any = found.get(key) if isinstance(found.get(key), dict) else {}
         desc, log = kwargs.get("desc"), kwargs.get("log")
-        if isinstance(desc, str) and _makes(env_id, GridWorld):
+        if isinstance(desc, str) and _makes(env_id, GridWorld | FrozenLakeEnv):
             try:
                 found[key] = {**kwargs, "desc": list(read_rows(desc))}
             except ValueError as error:
@@ -271,6 +302,6 @@ def map_name(env_id: str, entry: Mapping[str, Any]) -> str:
     return Path(given).name if is_path else ""
 
 
-def _makes(env_id: str, kind: type) -> bool:
-    creator = _creator(env_id)
+def _makes(env_id: str, kind: Any) -> bool:
+    creator = creator_of(env_id)
     return isinstance(creator, type) and issubclass(creator, kind)

@@ -55,7 +55,10 @@ def shown(value: object) -> str:
 
 def one_line(error: BaseException) -> str:
     """The message of an exception in one line, or its type if it has no message."""
-    return " ".join(str(error).split()) or type(error).__name__
+    try:
+        return " ".join(str(error).split()) or type(error).__name__
+    except Exception:  # noqa: BLE001  # a stranger's `__str__` can fail in any way
+        return type(error).__name__
 
 
 def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:
@@ -73,4 +76,6 @@ def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:
 def unknown(what: str, name: str, known: Iterable[str], n: int = 1) -> UserError:
     """The error for a ``name`` that is not among ``known``: "{what} 'name': did you mean ...?"."""
     hint = did_you_mean(name, known, n)
+    if "," in name:
+        hint = f"names are separated by blanks: {' '.join(name.replace(',', ' ').split())}"
     return UserError(f"{what} {shown(name)}{': ' if hint else ''}{hint}")

@@ -93,8 +93,12 @@ def read_arrays(
 def replacing(path: Path) -> Iterator[Path]:
     """A name beside ``path`` to write to, which then takes its place; the suffix is the same.
 
-    This is the only way in which a file gets its name, so files with their names are whole.
+    This is the only way in which a file gets its name, so files with their names are whole. Only
+    what is no regular file, such as /dev/stdout, is written into directly.
     """
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        yield path
+        return
     beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         yield beside

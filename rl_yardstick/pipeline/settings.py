@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from contextlib import closing, suppress
 from pathlib import Path
@@ -18,7 +19,13 @@ from typing import Any
 import yaml
 
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.pipeline.components import AUTO, WRAPPERS, arguments_of, check_arguments
+from rl_yardstick.pipeline.components import (
+    AUTO,
+    WRAPPERS,
+    arguments_of,
+    check_arguments,
+    digests_of,
+)
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec, validated
@@ -238,6 +245,14 @@ def check_agent(algo: str) -> None:
     if not entry.is_installed:
         fault = f"{entry.package}, which is not installed: {entry.install_command}"
         raise UserError(f"{algo} needs {fault}")
+    module, _, name = entry.entry_point.partition(":")
+    cls = getattr(sys.modules.get(module), name, None)  # imported already if it is the user's
+    bases = {base.__name__ for base in getattr(cls, "__mro__", ())}
+    if bases and "BaseAlgorithm" not in bases:
+        wanted = ("learn", "predict", "save", "load", "policy", "get_env")
+        missing = ", ".join(one for one in wanted if not hasattr(cls, one))
+        fault = "a subclass of BaseAlgorithm or of one of our base classes (docs/extending.md)"
+        raise UserError(f"{algo}: {entry.entry_point} must be {fault}; it lacks {missing}")
 
 
 def special_settings(entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -294,7 +309,9 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
     plain = {key: value for key, value in algorithm.items() if key not in asked}
     if str(special.get("n_timesteps")).startswith("auto"):
         asked.insert(0, str(special.pop("n_timesteps")))
-    found = {"algo": algo, "env_id": env_id, "algorithm": plain, **special, **fields}
+    code = digests_of(fields.get("gym_packages", ()))
+    found = {"algo": algo, "env_id": env_id, "algorithm": plain, "code": code}
+    found |= {**special, **fields}
     spec = validated(found)
     if any("auto" in wrapper.kwargs.values() for wrapper in spec.train_env_wrapper):
         spec = _with_rewards(spec)

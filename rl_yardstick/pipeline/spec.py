@@ -65,6 +65,7 @@ class TrainSpec(BaseModel):
     watch_learning: str | None = None  #: file of a page that plays the training
     watch_episodes: int = 0  #: episodes on it, for tables; 0: automatic
     gym_packages: list[str] = []  #: modules that the user typed
+    code: dict[str, str] = {}  #: the digest of the sources of each, by name
     map_name: str = ""  #: file of the environment's map, for titles
     origins: dict[str, str] = {}  #: where values come from that the entry does not have
 

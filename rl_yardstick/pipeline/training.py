@@ -23,6 +23,7 @@ from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.machine_code.compiling import compile_timer
 from rl_yardstick.pipeline import callbacks
 from rl_yardstick.pipeline.components import action_noise, build, constructor_arguments
+from rl_yardstick.pipeline.environment_trial import tried
 from rl_yardstick.pipeline.environments import first_seed, make_training_env, training_changes
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line
 from rl_yardstick.pipeline.evaluation.critics import recorder_of
@@ -59,6 +60,9 @@ def train(
     if spec.n_threads > 0:
         th.set_num_threads(spec.n_threads)
     spec = spec if spec.trained_agent is None else begun_with(spec)
+    spec, notes = tried(spec)
+    for note in notes:
+        run.console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     resumes = resumes and run.state_path.exists()
     agent = make_agent(spec, run.path, resumes)
     try:
@@ -85,7 +89,7 @@ def train(
             agent.env.close()
         if hasattr(agent, "_logger"):
             agent.logger.close()
-    run.record(spec, FINISHED, **training.figures())
+    run.record(spec, FINISHED, **training.figures(), **({"notes": notes} if notes else {}))
     run.state_path.unlink(missing_ok=True)
     return training
 

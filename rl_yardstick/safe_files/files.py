@@ -68,7 +68,10 @@ def content_of(source: Source, limit: int) -> bytes:
     """Read a whole regular file or stream of at most ``limit`` bytes."""
     if not isinstance(source, io.BufferedIOBase):
         with opened(Path(source), limit) as file:
-            return file.read()
+            content = file.read()
+        if content.startswith(b"version https://git-lfs"):
+            raise UnsafeFileError(f"{source} is a Git LFS pointer, not the file: run git lfs pull")
+        return content
     content = source.read(limit + 1)
     if len(content) > limit:
         raise UnsafeFileError(f"is larger than {limit:,} bytes")

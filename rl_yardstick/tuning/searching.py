@@ -14,9 +14,8 @@ import sqlite3
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -363,6 +362,7 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
     suggestions.check(root)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     with storage_errors(root):
+        _check_own(root)
         study = optuna.create_study(
             study_name=tuning.study.name,
             storage=open_storage(root),
@@ -389,9 +389,39 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
 
 def open_storage(root: Path) -> BaseStorage:
     """Open the SQLite file of the trials in the search's folder."""
-    # Opened by path, because in a URL some characters have another meaning.
-    connect = partial(sqlite3.connect, root / OWN_FILE, SECONDS_TO_WAIT, check_same_thread=False)
+
+    def connect() -> sqlite3.Connection:
+        # By path, because in a URL some characters have another meaning. With a log of writes, no
+        # rollback journal lies beside the file after a kill.
+        found = sqlite3.connect(root / OWN_FILE, SECONDS_TO_WAIT, check_same_thread=False)
+        found.execute("PRAGMA journal_mode = WAL")
+        return found
+
     return RDBStorage(f"sqlite:///{OWN_FILE}", engine_kwargs={"creator": connect})
+
+
+def _check_own(root: Path) -> None:
+    """Raise UserError, before anything is written, if another program made the file of trials."""
+    path = root / OWN_FILE
+    journal = path.with_name(f"{path.name}-journal")
+    if journal.exists():
+        fault = "opening the trials could change other files: look at it, and remove it"
+        raise UserError(f"{journal} is no file of ours, and {fault}")
+    if not path.exists():
+        return
+    query = (
+        "SELECT study_name FROM studies AS s WHERE NOT EXISTS (SELECT 1 FROM study_user_attributes "
+        "AS a WHERE a.study_id = s.study_id AND a.key = ?) AND (study_name != ? OR EXISTS "
+        "(SELECT 1 FROM trials AS t WHERE t.study_id = s.study_id))"
+    )
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as there:
+        try:
+            foreign = there.execute(query, (ASKED, root.name)).fetchone()
+        except sqlite3.OperationalError as error:  # no table of Optuna's
+            raise UserError(f"{path}: {one_line(error)}") from error
+    if foreign:
+        way_out = "read it with Optuna, or give this search another --name"
+        raise UserError(f"{path} holds the Optuna study {foreign[0]} of another program: {way_out}")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, Literal, cast
@@ -53,6 +54,8 @@ from rl_yardstick.agents.tabular.workspace import Workspace, WorkspaceAlgorithm
 from rl_yardstick.envs.wrappers import INFO_KEY
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 
+MOST_ENTRIES = 100_000_000  # of a table: 1.6 GB with the counts of visits
+
 
 class QTablePolicy(MaskBufferPolicy):
     """Greedy in the mean of one or two tables of action values.
@@ -70,6 +73,12 @@ class QTablePolicy(MaskBufferPolicy):
         self.n_tables = n_tables
         spaced: Any = self.observation_space, self.action_space
         shape = (n_tables, *(int(space.n) for space in spaced))
+        if math.prod(shape) > MOST_ENTRIES:
+            states, actions = spaced
+            raise ValueError(
+                f"a table for {states.n:,} states and {actions.n:,} actions is too large: at most "
+                f"{MOST_ENTRIES:,} entries; use a network, or a wrapper with fewer states"
+            )
         self.register_buffer("q_tables", th.zeros(shape, dtype=th.float64))
         self.register_buffer("visit_counts", th.zeros(shape, dtype=th.int64))
 

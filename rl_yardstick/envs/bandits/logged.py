@@ -7,6 +7,7 @@ Each row is one pull, under a header with the columns ``arm``, ``reward`` and, i
 from __future__ import annotations
 
 import csv
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -173,6 +174,9 @@ def _read_columns(binary: BinaryIO, own_names: Mapping[str, str]) -> dict[str, p
     if not len(frame):
         raise ValueError("it holds no pulls: a header and a row for each are needed")
     columns = {name: frame.iloc[:, i] for i, name in enumerate(header)}
+    if not header[0] and columns[""].tolist() == list(range(len(frame))):
+        warnings.warn("the log's first column, which counts the rows, is left out", stacklevel=2)
+        del columns[""]
     return {
         name: column if column.dtype.kind in "if" else column.astype(str).str.strip()
         for name, column in columns.items()

@@ -268,6 +268,12 @@ def settings(report: Report) -> Section | None:
         "versions": recorded("versions", infos),
         "machine": recorded("machine", infos),
         "mixed": mixed_versions(infos),
+        "notes": dict.fromkeys(
+            f"{on}: {note}"
+            for (_, on), found in runs.items()
+            for info in found
+            for note in info.get("notes", ())
+        ),
         "missing": _missing_runs(results),
     }
     return Section("settings", "Settings", context, by_environment=True)
