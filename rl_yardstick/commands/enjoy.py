@@ -55,7 +55,7 @@ FLAGS: Flags = {
         flag("--seed", "seed of the episodes (default: 0; -1: a random one)", cli.SEED, 0),
         flag("--render", "default: human with a display, else none", choices=RENDERED),
         flag("--no-render", "--render none", action="store_const", const="none", dest="render"),
-        flag("--record", "write a film, .gif or .mp4", metavar="FILE"),
+        flag("--record", "write a film (.gif)", metavar="FILE"),
         flag("--reward-log", "write the returns there, as Monitor's CSV files", metavar="DIR"),
         flag("--verbose", "0 for no output (default: 1)", whole_number(0, 2), 1),
         switch("--norm-reward", "returns of normalised rewards, as in training"),
