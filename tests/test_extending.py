@@ -16,7 +16,7 @@ CONTRIBUTING = (DOCS.parent / "CONTRIBUTING.md").read_text()
 COMMANDS = re.findall(r"^python ~/yardstick/(.*)$", DOCUMENT, re.M)
 
 
-def test_the_document_can_be_followed(type_in_own_folder, own_folder):
+def test_the_document_can_be_followed(type_in_own_folder, own_folder, in_this_process):
     for name, text in FILES:
         (own_folder / name).write_text(text)
     assert len(FILES) >= 6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -84,10 +85,10 @@ def read_compared(folder: Path) -> dict[str, Floats]:
     """Read the columns of the diagnosis that `pipeline.evaluation.critics` wrote."""
     path = folder / "diagnosis.csv"
     try:
-        content = io.BytesIO(read_bytes(path, MAX_TABLE))
-        found = pd.read_csv(content, dtype=np.float64, float_precision="round_trip")
-        known = [name for name in MEANINGS if name in found]
-        return {name: found[name].to_numpy() for name in ("timesteps", *known)}
+        names, *rows = csv.reader(read_bytes(path, MAX_TABLE).decode().splitlines())
+        table = np.array([[float(cell or "nan") for cell in row] for row in rows]).T
+        found = dict(zip(names, table, strict=True))
+        return {name: found[name] for name in ("timesteps", *MEANINGS) if name in found}
     except (ValueError, KeyError) as error:
         raise UserError(f"{path} is damaged: it is no table of numbers by step") from error
 

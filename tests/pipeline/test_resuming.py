@@ -13,10 +13,11 @@ import pytest
 import torch as th
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from rl_yardstick.experiments.results import read_compared
 from rl_yardstick.pipeline.callbacks import StateCallback
 from rl_yardstick.pipeline.errors import Stopped, UserError
 from rl_yardstick.pipeline.evaluation import sampled
-from rl_yardstick.pipeline.run import Run, read_diagnosis, resumable
+from rl_yardstick.pipeline.run import Run, resumable
 from rl_yardstick.pipeline.settings import override, read_entry, read_spec
 from rl_yardstick.pipeline.training import train
 from tests.pipeline.short_runs import CART, LAKE, SWING, run_of
@@ -195,7 +196,7 @@ def test_who_looks_on_leaves_the_same_agent(
         found = np.load(run.path / "evaluations.npz")[noted]
     elif "diagnose" in looks:
         assert "diagnosis.csv" not in names
-        found = read_diagnosis((run.path / "diagnosis.csv").read_bytes())[noted][:4]
+        found = read_compared(run.path)[noted][:4]
         assert np.isfinite(found).all()
     else:
         assert outcome.engine == plain.engine
