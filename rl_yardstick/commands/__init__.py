@@ -59,6 +59,7 @@ def run_command(name: str) -> NoReturn:
     # Until the work is done nothing ends this process with 0, such as os._exit in an environment.
     os._exit = lambda status: leave(status or int(os.getpid() == own))
     code = _exit_code(name)
+    os._exit = leave
     with suppress(OSError):
         sys.stdout.flush()
         sys.stderr.flush()

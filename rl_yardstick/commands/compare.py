@@ -222,6 +222,7 @@ def do_study(
     job: Job, study: StudySpec, planned: Sequence[PlannedRun], known: dict[Any, Any] | None = None
 ) -> StudyResults:
     """Do the missing runs of a study, and read all; ``known`` were read or failed before."""
+    from rl_yardstick.agents.registry import ALGORITHMS
     from rl_yardstick.experiments.pool import do_runs
 
     known = {} if known is None else known
@@ -231,6 +232,12 @@ def do_study(
     job.console.print(
         f"{len(planned)} runs, {n_done} of them there already; {job.workers.words}, in {job.root}"
     )
+    if slow := {run.agent for run in to_do if ALGORITHMS[run.spec.algo].for_bandits} - {
+        run.agent for run in to_do if run.is_batch
+    }:
+        ways = "-n up to the time limit, or --env-kwargs max_episode_steps:N"
+        told = f"seeds of {', '.join(sorted(slow))} are done one by one, about 100 times as slowly"
+        job.console.print(f"note: {told} as a batch, which needs runs of one episode: {ways}")
     try:
         failures |= do_runs(to_do, job.workers, job.command, job.console, job.stop)
     finally:

@@ -184,19 +184,20 @@ class TerminationReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 class WithoutEpisodeInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Leaves out ``info["episode"]`` of an environment, because Monitor's has this name."""
+    """Leaves out an environment's own ``info["episode"]``, which is the key of Monitor.
+
+    At the end of an episode the Monitor within has replaced it.
+    """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
 
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        obs, info = self.env.reset(**kwargs)
-        return obs, {key: value for key, value in info.items() if key != "episode"}
-
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        *found, info = self.env.step(action)
-        return *found, {key: value for key, value in info.items() if key != "episode"}
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if not (terminated or truncated):
+            info = {key: value for key, value in info.items() if key != "episode"}
+        return obs, reward, terminated, truncated, info
 
 
 class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):

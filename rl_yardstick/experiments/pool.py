@@ -161,8 +161,10 @@ def process_pool(n_workers: int) -> ProcessPool:
 
 def _follow_parent() -> None:
     """Let a worker end with the command that started it, also after a SIGKILL."""
-    parent = multiprocessing.parent_process()
+    parent, leave = multiprocessing.parent_process(), os._exit
     assert parent is not None
+    # The pool waits for ever for a process that ended with 0, as by os._exit in an environment.
+    os._exit = lambda status: leave(status or 1)
 
     def watch() -> None:
         wait_for([parent.sentinel])

@@ -38,7 +38,7 @@ def tried(spec: TrainSpec) -> tuple[TrainSpec, list[str]]:
         return spec, []
     states = random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
     try:
-        with closing(make_single_env(spec, training=True)) as env:
+        with closing(make_single_env(spec, training=True, disable_env_checker=True)) as env:
             _check_calls(spec.env_id, env.unwrapped)
         first = _Trial(spec, N_STEPS)
         second = _Trial(spec, len(first.steps))
@@ -87,7 +87,7 @@ class _Trial:
         self.steps: list[Any] = []  # observations, rewards and ends
         self.first_return = 0.0
         end = time.monotonic() + MOST_SECONDS
-        with closing(make_single_env(spec, training=True)) as env:
+        with closing(make_single_env(spec, training=True, disable_env_checker=True)) as env:
             # An environment may make its own space anew, or seed it, in `reset`.
             self.space, actions = env.observation_space, copy.deepcopy(env.action_space)
             actions.seed(0)

@@ -41,7 +41,7 @@ def check_env_id(env_id: str) -> None:
     module, name = split_id(env_id)
     if module:
         raise UserError(f"{env_id}: name it {name}, and add --gym-packages {module}")
-    if env_id not in gym.registry and env_id.startswith("ALE/"):
+    if env_id not in gym.registry and ("ALE/" in env_id or "NoFrameskip" in env_id):
         raise UserError(f"{env_id}: pip install ale-py, and add --gym-packages ale_py")
     if env_id not in gym.registry:
         raise unknown("unknown environment", env_id, gym.registry, n=3)
@@ -69,7 +69,7 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> Env:
 
 def _parameters(env_id: str) -> Mapping[str, inspect.Parameter]:
     """The arguments of the class or function that makes an environment."""
-    with suppress(ImportError, AttributeError, TypeError, ValueError):
+    with suppress(ImportError, AttributeError, TypeError, ValueError, gym.error.Error):
         return inspect.signature(creator_of(env_id)).parameters
     return {}
 
@@ -187,10 +187,10 @@ def _wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = No
         raise UserError(f"mask_actions: {one_line(error)}") from error
 
 
-def make_single_env(spec: TrainSpec, training: bool = False) -> Env:
-    """Make one wrapped environment, outside any VecEnv."""
+def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> Env:
+    """Make one wrapped environment, outside any VecEnv; ``extra`` are further arguments of it."""
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
-    return _wrapped(spec, make_env(spec.env_id, kwargs), training)
+    return _wrapped(spec, make_env(spec.env_id, {**kwargs, **extra}), training)
 
 
 def first_seed(spec: TrainSpec) -> int:

@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 import threading
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
@@ -133,6 +134,8 @@ class Run:
         """Write what the run is about to do: settings for rl_zoo3, and ``run.json``."""
         import yaml
 
+        if time.localtime().tm_year < 1980:
+            raise UserError("the clock of this machine stands before 1980, where zip files begin")
         settings = self.path / spec.env_name
         settings.mkdir(exist_ok=True)
         # rl_zoo3's tools use env_kwargs in args.yml before those in config.yml.

@@ -1,0 +1,48 @@
+"""Each example of each ``--help``, but for its length, in a folder with what it names."""
+
+import importlib
+import re
+import shlex
+import shutil
+
+from rl_yardstick.commands import COMMANDS
+
+# What makes an example short, in place of its own words or behind them.
+LENGTHS = (
+    (r"--n-episodes 5000", "--n-episodes 20"),
+    (r"(train\.py .*--engine auto)", r"\1 -n 64"),
+    (r"enjoy\.py", "enjoy.py --render none -n 20"),
+    (r"logs/my_study", "logs/studies/my_study"),
+)
+LONG = ("compare", "tune", "audit")  # of these only the flags are read
+FIRST = """
+train.py --algo ppo --env Warehouse-v0 -n 64 --seed 0
+train.py --algo sarsa --env Warehouse-v0 -n 64
+train.py --algo dqn --env CartPole-v1 -n 20000 --save-freq 20000 -params learning_starts:20000
+compare.py --algos dqn --env Taxi-v4 -n 20 --seeds 1 --name my_study --no-report
+"""
+
+
+def test_every_example_works(type_in_own_folder, own_folder, in_this_process):
+    modules = [importlib.import_module(f"rl_yardstick.commands.{c}") for c in COMMANDS]
+    texts = [getattr(module, "EPILOG", "") for module in modules]
+    examples = [line for text in texts for line in re.findall(r"^  (python .*)$", text, re.M)]
+    assert len(examples) >= 20
+    for example in [*FIRST.strip().splitlines(), "", *examples]:
+        if not example:  # these are the third runs, one of them without an end
+            for run in ("ppo/Warehouse-v0_", "dqn/CartPole-v1_"):
+                shutil.copytree(own_folder / "logs" / f"{run}1", own_folder / "logs" / f"{run}3")
+            record = own_folder / "logs" / "ppo" / "Warehouse-v0_3" / "run.json"
+            record.write_text(record.read_text().replace('"finished"', '"interrupted"'))
+            continue
+        line = example.removeprefix("python ").removeprefix("-m rl_")
+        for pattern, short in LENGTHS:
+            line = re.sub(pattern, short, line)
+        words = shlex.split(line, comments=True)
+        command, *flags = words[words[0] == "yardstick" :]
+        if command.removesuffix(".py") in LONG and "my_study" not in line:
+            module = importlib.import_module(f"rl_yardstick.commands.{command.removesuffix('.py')}")
+            module.build_parser().parse_args(flags)
+            continue
+        code, out, err = type_in_own_folder(*words)
+        assert (code, err) == (0, ""), f"{line}\n{out}{err}"

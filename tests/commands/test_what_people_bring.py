@@ -1,0 +1,232 @@
+"""What people bring works, or one line says why: a command for each case, as a user types it."""
+
+import json
+import os
+import shlex
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import optuna
+import pytest
+
+from rl_yardstick.agents import ALGORITHMS
+
+HERE, ROOT = Path(__file__).parent, Path(__file__).parents[2]
+FLAT = "rl_yardstick.envs.wrappers.FlattenToDiscrete"
+BINS = "rl_yardstick.envs.wrappers.DiscretizeObservation"
+SHORT = ("-n", "2000", "--seed", "0")
+
+
+@pytest.fixture
+def train(type_in_own_folder, own_folder):
+    """Train on one of the strange environments: exit code, output, errors."""
+    (own_folder / "strange.py").write_bytes((HERE / "strange_environments.py").read_bytes())
+
+    def run(env, *words, algo="qlearning"):
+        choice = ("--gym-packages", "strange", "--env", f"{env}-v0", "--algo", algo)
+        return type_in_own_folder("train.py", *choice, *SHORT, *words)
+
+    return run
+
+
+REFUSED = [
+    ("FourValues", "qlearning", "step returns 4 values, not observation, reward, terminated"),
+    ("NoSeed", "qlearning", "Gymnasium calls reset(seed=..., options=...), which the environment"),
+    ("ObsOnly", "qlearning", "reset returns one value, not observation, info"),
+    ("Half", "qlearning", "at step 0 the observation 0.5 is not in Discrete(5)"),
+    ("Seven", "qlearning", "the observation 7 is not in Discrete(5)"),
+    ("OtherShape", "ppo", "has the shape (3,), and its space the shape (2,)"),
+    ("Huge", "qlearning", "a table for 1,000,000,000 states and 2 actions is too large"),
+]
+
+
+@pytest.mark.parametrize(("env", "algo", "said"), REFUSED)
+def test_what_nothing_can_learn_on_is_refused(train, own_folder, env, algo, said):
+    code, out, err = train(env, algo=algo)
+    assert (code, err.count("\n")) == (2, 1), out + err
+    assert said in err
+    assert not (own_folder / "logs").exists()
+
+
+NOTED = [
+    ("Unseeded", "qlearning", "the environment is not reproducible: seed 0 gave "),
+    ("EpisodeInfo", "qlearning", "the environment's own info['episode'] is left out"),
+    ("OtherType", "ppo", "observations are float64, and their space is float32"),
+    ("OutOfBounds", "ppo", "observations leave the bounds of their space"),
+]
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN.*:UserWarning")  # Gymnasium's own
+@pytest.mark.parametrize(("env", "algo", "said"), NOTED)
+def test_what_is_odd_is_said_once(train, own_folder, env, algo, said):
+    code, out, err = train(env, *(["-params", "n_steps:64"] if algo == "ppo" else []), algo=algo)
+    assert (code, out.count(said)) == (0, 1), out + err
+    (record,) = own_folder.glob("logs/*/*/run.json")
+    assert said in json.loads(record.read_text())["notes"][0]
+
+
+def test_without_a_fault_nothing_is_said(train):
+    code, out, err = train("Line")
+    assert (code, err) == (0, "")
+    assert "note:" not in out
+    assert "return -4 " in out
+
+
+@pytest.mark.parametrize("env", ["FromOne", "Pair", "Many", "Named", "Vector"])
+def test_a_wrapper_of_ours_fits_and_is_named_to_be_typed(train, env):
+    code, _, err = train(env)
+    assert (code, err.count("\n")) == (2, 1)
+    assert (BINS if env == "Vector" else FLAT) in err
+    code, out, err = train(env, *shlex.split(err.partition("or add ")[2]))
+    assert (code, err) == (0, ""), err
+    assert "return -4 " in out
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("keys", "P must map states, the numbers 0 to 4, to mappings of actions; it begins with"),
+        ("triples", "state 0, action 0: an outcome is (probability, next state, reward, termina"),
+        ("start", "has P, but not initial_state_distrib, the probabilities of the starting"),
+        ("single", "return -4 of -4 "),
+    ],
+)
+def test_a_wrong_table_of_outcomes(train, fault, said):
+    code, out, err = train("Known", "--env-kwargs", f"fault:{fault}")
+    assert (code, err) == (0, ""), err
+    assert said in out
+
+
+def typed_in_a_shell(folder, *words, **env):
+    """A process of its own, because these would end the tests, or are read when it starts."""
+    env = {**os.environ, "PYTHONPATH": f"{folder}:{ROOT}", **env}
+    command = [sys.executable, ROOT / words[0], *words[1:]]
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+STRANGE = ("--gym-packages", "strange")
+
+
+def test_a_process_that_is_left_early_has_not_succeeded(train, own_folder):
+    words = (*STRANGE, "--env", "Leaves-v0", *SHORT)
+    assert typed_in_a_shell(own_folder, "train.py", "--algo", "qlearning", *words)[0] == 1
+    words = (*STRANGE, "--env", "Leaves-v0", "-n", "200", "--seeds", "1", "--no-report")
+    code, said = typed_in_a_shell(own_folder, "compare.py", "--algos", "qlearning", *words)
+    assert code == 1, said
+    assert "failed: qlearning on Leaves-v0" in said
+
+
+def test_an_exception_without_words_ends_the_run(train, own_folder):
+    code, _, err = train("Rude", "--env-kwargs", "x:1")
+    assert code == 2
+    (own_folder / "now").touch()
+    code, _, err = train("Rude")
+    assert code == 1
+    assert "RudeError" in err
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def test_a_map_from_another_editor(type_in_own_folder, own_folder):
+    (own_folder / "lake.txt").write_bytes(b"SF  \r\nFG\r\n")
+    words = ("--algo", "qlearning", "--env", "FrozenLake-v1", "--env-kwargs", "desc:lake.txt")
+    code, out, err = type_in_own_folder("train.py", *words, "is_slippery:False", *SHORT)
+    assert (code, err) == (0, ""), err
+    assert "return 1 of 1 " in out
+
+
+def test_a_log_with_the_index_of_pandas(type_in_own_folder, own_folder):
+    rows = [f"{i},{i % 2},{i % 2},0.5" for i in range(200)]
+    (own_folder / "log.csv").write_text("\n".join([",arm,reward,propensity", *rows]) + "\n")
+    words = ("--env", "ReplayBandit-v0", "--algo", "ucb", "--env-kwargs", "log:log.csv", *SHORT)
+    with pytest.warns(UserWarning, match="first column, which counts the rows, is left out"):
+        code, _, err = type_in_own_folder("train.py", *words)
+    assert (code, err) == (0, "")
+
+
+def test_a_pointer_in_place_of_a_model(type_in_own_folder, own_folder):
+    (own_folder / "model.zip").write_text("version https://git-lfs.github.com/spec/v1\noid 1\n")
+    for words in ("enjoy.py model.zip --algo ppo --env CartPole-v1", "yardstick inspect model.zip"):
+        code, _, err = type_in_own_folder(*words.split())
+        assert (code, err.count("\n")) == (2, 1)
+        assert "model.zip is a Git LFS pointer, not the file: run git lfs pull" in err
+
+
+def test_results_go_into_what_is_no_file(type_in_own_folder, own_folder):
+    pipe = own_folder / "pipe"
+    os.mkfifo(pipe)
+    reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    words = ("shaping", "--env", "FrozenLake-v1", "-params", "gamma:0.9", "--json", "pipe")
+    code, _, err = type_in_own_folder("yardstick", *words)
+    assert (code, err) == (0, ""), err
+    assert json.loads(os.read(reading, 1 << 20))
+    assert pipe.is_fifo()
+    os.close(reading)
+
+
+SEARCH = ("tune.py", "--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "50", "--name", "mine")
+
+
+def test_a_study_of_another_program_is_never_written(type_in_own_folder, own_folder):
+    folder = own_folder / "logs" / "tuning" / "mine"
+    folder.mkdir(parents=True)
+    path = folder / "trials.db"
+    study = optuna.create_study(study_name="mine", storage=f"sqlite:///{path}")
+    study.optimize(lambda trial: trial.suggest_float("x", 0, 1), n_trials=1)
+    before = path.read_bytes()
+    code, _, err = type_in_own_folder(*SEARCH)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "holds the Optuna study mine of another program" in err
+    journal = folder / "trials.db-journal"
+    journal.write_bytes(b"planted")
+    code, _, err = type_in_own_folder(*SEARCH)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "trials.db-journal is no file of ours" in err
+    assert (path.read_bytes(), journal.read_bytes()) == (before, b"planted")
+    with sqlite3.connect(path) as there:
+        assert there.execute("SELECT count(*) FROM studies").fetchone() == (1,)
+
+
+# --- code -----------------------------------------------------------------------------------------
+
+OWN = """
+from rl_yardstick import agents
+from rl_yardstick.agents.tabular.q_learning_and_sarsa import QLearning
+
+agents.register("mine", "own_agents:Mine", observations=["Discrete"])
+agents.register("plain", "own_agents:Plain", observations=["Discrete"])
+
+class Mine(QLearning):
+    pass
+
+class Plain:
+    def act(self, obs):
+        return 0
+    def learn(self):
+        return self
+"""
+
+
+def test_a_plain_class_is_told_what_it_lacks(type_in_own_folder, own_folder):
+    (own_folder / "own_agents.py").write_text(OWN)
+    words = ("--gym-packages", "own_agents", "--env", "FrozenLake-v1", "--algo", "plain", *SHORT)
+    code, _, err = type_in_own_folder("train.py", *words)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "it lacks predict, save, load, policy, get_env" in err
+
+
+def test_runs_of_other_code_are_not_taken(type_in_own_folder, own_folder, in_this_process):
+    words = ("--gym-packages", "own_agents", "--env", "FrozenLake-v1", "--algos", "mine")
+    words += ("-n", "50", "--seeds", "1", "--no-report")
+    answers = []
+    for code in (OWN, OWN, OWN.replace("pass", "trait = 1")):
+        (own_folder / "own_agents.py").write_text(code)
+        answers.append(type_in_own_folder("compare.py", *words))
+        del sys.modules["own_agents"], ALGORITHMS["mine"], ALGORITHMS["plain"]
+    assert [code for code, *_ in answers] == [0, 0, 2]
+    assert "1 runs, 1 of them there already" in answers[1][1]
+    assert "1 finished run has other settings (code: " in answers[2][2]
