@@ -1,4 +1,4 @@
-"""Environments of others, each with one fault: what commands say of them is in a table."""
+"""Environments of others, each with one fault."""
 
 import os
 from pathlib import Path
@@ -49,75 +49,6 @@ class NoSeed(Line):
         return super().reset()
 
 
-class ObsOnly(Line):
-    def reset(self, seed=None, options=None):
-        return super().reset(seed=seed)[0]
-
-
-class Half(Line):
-    def seen(self):
-        return self.place + 0.5
-
-
-class Seven(Line):
-    def seen(self):
-        return 7 if self.place else 0
-
-
-class Vector(Line):
-    observation_space = spaces.Box(0, 4, (2,), np.float32)
-
-    def seen(self):
-        return np.full(2, self.place, np.float32)
-
-
-class OtherShape(Vector):
-    def seen(self):
-        return np.full(3 if self.place else 2, self.place, np.float32)
-
-
-class OtherType(Vector):
-    def seen(self):
-        return np.full(2, self.place, np.float64)
-
-
-class OutOfBounds(Vector):
-    def seen(self):
-        return np.full(2, 2 * self.place, np.float32)
-
-
-class FromOne(Line):
-    observation_space = spaces.Discrete(5, start=1)
-
-    def seen(self):
-        return self.place + 1
-
-
-class Pair(Line):
-    observation_space = spaces.Tuple((spaces.Discrete(5), spaces.Discrete(2)))
-
-    def seen(self):
-        return self.place, 0
-
-
-class Many(Pair):
-    observation_space = spaces.MultiDiscrete([5, 2])
-
-    def seen(self):
-        return np.array([self.place, 0])
-
-
-class Named(Pair):
-    observation_space = spaces.Dict(place=spaces.Discrete(5), lamp=spaces.Discrete(2))
-
-    def seen(self):
-        return {"place": self.place, "lamp": 0}
-
-
-class Huge(Line):
-    observation_space = spaces.Discrete(10**9)
-
-
 class Leaves(Line):
     def step(self, action):
         return os._exit(0) if self.steps == 20 else super().step(action)
@@ -153,6 +84,24 @@ class Known(Line):
             self.initial_state_distrib = np.eye(5)[0]
 
 
-for kind in [*globals().values()]:
-    if isinstance(kind, type) and issubclass(kind, Line):
+NUMBERS, VECTORS = Line.observation_space, spaces.Box(0, 4, (2,), np.float32)
+PAIR = spaces.Discrete(5), spaces.Discrete(2)
+# The space of observations, and what is seen at a place.
+SEEN = {
+    "Half": (NUMBERS, lambda place: place + 0.5),
+    "Seven": (NUMBERS, lambda place: 7 if place else 0),
+    "Vector": (VECTORS, lambda place: np.full(2, place, np.float32)),
+    "OtherShape": (VECTORS, lambda place: np.full(3 if place else 2, place, np.float32)),
+    "OtherType": (VECTORS, lambda place: np.full(2, place, np.float64)),
+    "FromOne": (spaces.Discrete(5, start=1), lambda place: place + 1),
+    "Pair": (spaces.Tuple(PAIR), lambda place: (place, 0)),
+    "Many": (spaces.MultiDiscrete([5, 2]), lambda place: np.array([place, 0])),
+    "Named": (spaces.Dict(at=PAIR[0], on=PAIR[1]), lambda place: {"at": place, "on": 0}),
+    "Huge": (spaces.Discrete(10**9), lambda place: place),
+}
+for name, (space, look) in SEEN.items():
+    members = {"observation_space": space, "seen": lambda self, look=look: look(self.place)}
+    gym.register(f"{name}-v0", type(name, (Line,), members))
+for kind in (Line, *Line.__subclasses__()):
+    if f"{kind.__name__}-v0" not in gym.registry:
         gym.register(f"{kind.__name__}-v0", kind)
