@@ -108,9 +108,6 @@ def test_an_exception_without_words_ends_the_run(train, own_folder):
     assert "RudeError" in err
 
 
-# --- files ----------------------------------------------------------------------------------------
-
-
 def test_a_map_from_another_editor(type_in_own_folder, own_folder):
     (own_folder / "lake.txt").write_bytes(b"SF  \r\nFG\r\n")
     words = ("--algo", "qlearning", "--env", "FrozenLake-v1", "--env-kwargs", "desc:lake.txt")
@@ -166,8 +163,6 @@ def test_a_study_of_another_program_is_never_written(type_in_own_folder, own_fol
     assert "trials.db-journal is no file of ours" in err
     assert (path.read_bytes(), journal.read_bytes()) == (before, b"planted")
 
-
-# --- code -----------------------------------------------------------------------------------------
 
 OWN = """
 from rl_yardstick import agents
