@@ -206,7 +206,7 @@ def _others(folder: Path) -> list[Case]:
 
 # --- what is compared: contents of files without times and durations ------------------------------
 
-TIMES = ("seconds", "cpu_seconds")
+TIMES = ("seconds", "cpu_seconds", "pid")
 # Also digests of files with times, the settings with the folder's name, and the process.
 NOT_COMPARED = (*TIMES, "began", "date", "ended", "files", "spec", "process", "command", "packed")
 

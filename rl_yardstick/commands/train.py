@@ -46,7 +46,7 @@ examples:
 FLAGS: Flags = {
     "": (
         flag("--algo", "agent (default: ppo; see --list)", default="ppo"),
-        flag("--env", "environment id (default: CartPole-v1; see --list)"),
+        flag("--env", "environment id (default: CartPole-v1; see --list)", default="CartPole-v1"),
         switch("--list", "list agents and environments, and which fit which"),
     ),
     "budget and settings": (
@@ -101,10 +101,6 @@ def main() -> int:
 
     stop = Stop().listen()
     console = TextConsole(quiet=args.verbose < 1, force_terminal=args.progress or None)
-    if args.env is None:
-        args.env = "CartPole-v1"
-        if args.resume is None:
-            console.print("no --env is given: CartPole-v1", style="dim", highlight=False)
     if args.resume is not None:
         return resume(Run(unfinished_run(args), console, stop), args)
     spec = spec_from_flags(args)

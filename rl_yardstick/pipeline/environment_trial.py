@@ -42,6 +42,10 @@ def tried(spec: TrainSpec) -> tuple[TrainSpec, list[str]]:
             _check_calls(spec.env_id, env.unwrapped)
         first = _Trial(spec, N_STEPS)
         second = _Trial(spec, len(first.steps))
+    except UserError:
+        raise
+    except (Exception, SystemExit):  # noqa: BLE001  # of the user's code: training will meet it
+        return spec, []
     finally:
         random.setstate(states[0])
         np.random.set_state(states[1])  # noqa: NPY002

@@ -158,7 +158,7 @@ def test_a_maps_rows_take_the_place_of_its_path_and_a_log_is_found_from_other_fo
         for each in (settings, read):
             assert with_files_read("Warehouse-v0", each) == read
         assert settings[key]["desc"] == "map.txt"
-    assert with_files_read("FrozenLake-v1", settings) == settings
+    assert with_files_read("CartPole-v1", settings) == settings
     logs = {"env_kwargs": {"log": "pulls.csv"}, "eval_env_kwargs": {"log": "/a.csv"}}
     found = with_files_read("ReplayBandit-v0", logs)
     assert found == {**logs, "env_kwargs": {"log": str(tmp_path / "pulls.csv")}}
