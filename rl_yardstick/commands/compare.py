@@ -113,7 +113,7 @@ def build_parser() -> OneLineParser:
 def main() -> int:
     """Do a study, or judge policies on a log; return the exit code."""
     args = build_parser().parse_args()
-    from rl_yardstick.pipeline.components import check_typed
+    from rl_yardstick.pipeline.components import check_code, check_typed
     from rl_yardstick.pipeline.run import Stop
 
     stop = Stop().listen()
@@ -127,6 +127,8 @@ def main() -> int:
         cli.check_alone(build_parser(), _BESIDE_RESUME)
         root, record = args.resume, StudyRecord.read(args.resume)
         check_typed(record.study.gym_packages, args.gym_packages, str(root))
+        for spec in record.specs.values():
+            check_code(spec, str(root))
     else:
         study = study_spec(args)
         root, record = Path(args.log_folder) / study.name, StudyRecord(study, specs_of(study))

@@ -232,7 +232,7 @@ def page_path(args: argparse.Namespace) -> str:
 
 def resume(run: Run, args: argparse.Namespace) -> int:
     """Resume a run whose modules were typed."""
-    from rl_yardstick.pipeline.components import check_typed
+    from rl_yardstick.pipeline.components import check_code, check_typed
     from rl_yardstick.pipeline.run import FINISHED, resumable
 
     if args.resume_or_start and run.recorded().get("state") == FINISHED:
@@ -240,6 +240,7 @@ def resume(run: Run, args: argparse.Namespace) -> int:
         return 0
     spec = resumable(run.path)
     check_typed(spec.gym_packages, args.gym_packages, str(run.path))
+    check_code(spec, str(run.path))
     return carry_out(spec.changed(gym_packages=args.gym_packages), run, args, resumes=True)
 
 

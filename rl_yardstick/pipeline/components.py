@@ -101,6 +101,13 @@ def digests_of(typed: Iterable[str]) -> dict[str, str]:
     return found
 
 
+def check_code(spec: TrainSpec, where: str) -> None:
+    """Raise UserError if the user's modules have changed since a training was begun."""
+    here = digests_of(spec.gym_packages)
+    if changed := [name for name in here if spec.code.get(name, here[name]) != here[name]]:
+        raise UserError(f"{where} was begun with other code of {', '.join(changed)}")
+
+
 def split_id(env_id: str) -> tuple[str, str]:
     """The module and the id in ``module:Env-v0``, Gymnasium's form; an empty module without it."""
     module, _, name = env_id.rpartition(":")

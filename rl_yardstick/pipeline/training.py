@@ -60,6 +60,7 @@ def train(
     if spec.n_threads > 0:
         th.set_num_threads(spec.n_threads)
     spec = spec if spec.trained_agent is None else begun_with(spec)
+    asked = spec  # recorded without what the environment needs
     spec, notes = tried(spec)
     for note in notes:
         run.console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
@@ -78,18 +79,18 @@ def train(
             training.save()
             training.evaluation.write()
             figures = {"stopped_by": stopped.number, "n_timesteps": agent.num_timesteps}
-            run.record(spec, INTERRUPTED, **figures)
+            run.record(asked, INTERRUPTED, **figures)
         raise
     except BaseException as error:
         if run.has_begun or not run.is_new:
-            run.record(spec, FAILED, reason=one_line(error))
+            run.record(asked, FAILED, reason=one_line(error))
         raise
     finally:
         if agent.env is not None:
             agent.env.close()
         if hasattr(agent, "_logger"):
             agent.logger.close()
-    run.record(spec, FINISHED, **training.figures(), **({"notes": notes} if notes else {}))
+    run.record(asked, FINISHED, **training.figures(), **({"notes": notes} if notes else {}))
     run.state_path.unlink(missing_ok=True)
     return training
 

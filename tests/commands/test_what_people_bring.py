@@ -201,3 +201,5 @@ def test_runs_of_other_code_are_not_taken(type_in_own_folder, own_folder, in_thi
     assert [code for code, *_ in answers] == [0, 0, 2]
     assert "1 runs, 1 of them there already" in answers[1][1]
     assert "1 finished run has other settings (code: " in answers[2][2]
+    resuming = ("compare.py", "--resume", "logs/studies/FrozenLake-v1_mine", *words[:2])
+    assert "was begun with other code of own_agents" in type_in_own_folder(*resuming)[2]
