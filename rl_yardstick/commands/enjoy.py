@@ -125,6 +125,8 @@ def found_model(console: Console, wanted: Wanted) -> Model:
 
     found = find_model(wanted)
     say(console, f"{found.spec.algo} on {found.spec.env_id}: {found.path}")
+    if found.statistics is not None:
+        say(console, f"observations normalised by {found.statistics}")
     return found
 
 
