@@ -27,6 +27,7 @@ from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage, RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.pool import NullPool
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.experiments.plan import PlannedRun, plan
@@ -392,12 +393,13 @@ def open_storage(root: Path) -> BaseStorage:
 
     def connect() -> sqlite3.Connection:
         # By path, because in a URL some characters have another meaning. With a log of writes, no
-        # rollback journal lies beside the file after a kill.
+        # rollback journal lies beside the file after a kill. Closing writes the log into the file.
         found = sqlite3.connect(root / OWN_FILE, SECONDS_TO_WAIT, check_same_thread=False)
         found.execute("PRAGMA journal_mode = WAL")
         return found
 
-    return RDBStorage(f"sqlite:///{OWN_FILE}", engine_kwargs={"creator": connect})
+    options = {"creator": connect, "poolclass": NullPool}
+    return RDBStorage(f"sqlite:///{OWN_FILE}", engine_kwargs=options)
 
 
 def _check_own(root: Path) -> None:
@@ -417,7 +419,7 @@ def _check_own(root: Path) -> None:
     with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as there:
         try:
             foreign = there.execute(query, (ASKED, root.name)).fetchone()
-        except sqlite3.OperationalError as error:  # no table of Optuna's
+        except sqlite3.DatabaseError as error:  # none, or without Optuna's tables
             raise UserError(f"{path}: {one_line(error)}") from error
     if foreign:
         way_out = "read it with Optuna, or give this search another --name"

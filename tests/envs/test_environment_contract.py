@@ -227,7 +227,7 @@ MISTAKEN = [
     (lambda: cart_pole(low=None), "dimension 3 of the observation has the bounds -inf and 50.0: g"),
     (lambda: cart_pole(low=[1, -50]), "dimension 2 of .* has the bounds 1.0 and 0.418"),
     (lambda: cart_pole(bins=0), "bins must be whole numbers from 1 on, not 0"),
-    (lambda: wrap.FlattenToDiscrete(gym.make("CartPole-v1")), "needs MultiDiscrete, a Tuple of"),
+    (lambda: wrap.FlattenToDiscrete(gym.make("CartPole-v1")), "needs MultiDiscrete, a Tuple or"),
     (lambda: wrap.ScaleReward(gym.make("CartPole-v1"), 0), "scale must not be 0"),
     (lambda: wrap.ActionMasks(gym.make("CartPole-v1")), "^CartPole-v1 has no action masks"),
     (lambda: wrap.IdleActionMasks(gym.make("CartPole-v1")), "needs an environment that holds P"),
