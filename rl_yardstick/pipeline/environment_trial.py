@@ -64,7 +64,7 @@ def tried(spec: TrainSpec) -> tuple[TrainSpec, list[str]]:
 
 def _check_calls(env_id: str, env: Any) -> None:
     """Raise UserError if the environment has the calls of Gym before version 0.26."""
-    way_out = "its apply_api_compatibility is gone: wrap the environment, or port it"
+    way_out = "Gymnasium has no apply_api_compatibility any more: wrap or port the environment"
     try:
         found = env.reset(seed=0)
     except TypeError as error:

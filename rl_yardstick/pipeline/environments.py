@@ -147,8 +147,8 @@ def check_fit(spec: TrainSpec) -> None:
             spaces = env.observation_space, env.action_space
             fitting = fitting_algorithms(*spaces, is_bandit(env), has_masks(env))
             ways = [f"fitting agents: {', '.join(fitting)}"] if fitting else []
-            ways += [f"or add {flag}" for flag in _fitting_wrappers(spec, env)]
-            others = "; ".join(ways) or "no agent here fits"
+            ways += [f"add {flag}" for flag in _fitting_wrappers(spec, env)]
+            others = "; or ".join(ways) or "no agent here fits"
             raise UserError(f"{spec.algo} does not fit {spec.env_id}: {misfit}; {others}")
 
 

@@ -69,7 +69,7 @@ def test_a_wrapper_of_ours_fits_and_is_named_to_be_typed(train, env):
     code, _, err = train(env)
     assert (code, err.count("\n")) == (2, 1)
     assert (BINS if env == "Vector" else FLAT) in err
-    code, out, err = train(env, *shlex.split(err.partition("or add ")[2]))
+    code, out, err = train(env, *shlex.split(err.partition("add ")[2]))
     assert (code, err) == (0, ""), err
     assert "return -4 " in out
     assert "note:" not in out
