@@ -183,15 +183,8 @@ class TerminationReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return obs, reward, terminated, truncated, info
 
 
-class WithoutEpisodeInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Leaves out an environment's own ``info["episode"]``, which is the key of Monitor.
-
-    At the end of an episode the Monitor within has replaced it.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        RecordConstructorArgs.__init__(self)
-        gym.Wrapper.__init__(self, env)
+class WithoutEpisodeInfo(gym.Wrapper[Any, Any, Any, Any]):
+    """Leaves out ``info["episode"]`` until an episode ends, where the Monitor within sets it."""
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self.env.step(action)

@@ -268,12 +268,11 @@ def settings(report: Report) -> Section | None:
         "versions": recorded("versions", infos),
         "machine": recorded("machine", infos),
         "mixed": mixed_versions(infos),
-        "notes": dict.fromkeys(
+        "notes": [  # of a run on each: the numbers in them are others in every run
             f"{on}: {note}"
-            for (_, on), found in runs.items()
-            for info in found
+            for on, info in {on: found[0] for (_, on), found in runs.items()}.items()
             for note in info.get("notes", ())
-        ),
+        ],
         "missing": _missing_runs(results),
     }
     return Section("settings", "Settings", context, by_environment=True)
