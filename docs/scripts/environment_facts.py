@@ -43,11 +43,6 @@ LIMIT = 1000  # the commands' time limit for an environment without one
 MOST_REWARDS = 8
 
 
-def environment_block(env_id: str, *arguments: str) -> str:
-    """The picture, the facts and the docstring of an environment of this project."""
-    return f"{facts_block(env_id, *arguments)}\n{docstring_block(env_id)}"
-
-
 def docstring_block(env_id: str) -> str:
     """The docstring of an environment."""
     entry_point = gym.spec(env_id).entry_point

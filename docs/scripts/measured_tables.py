@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+MEASURED = Path(__file__).resolve().parents[1] / "measured"
 
 
-def timings_block(path: str) -> str:
+def timings_block(name: str) -> str:
     """A row for each contender, with its speed relative to the first contender of its work.
 
     Args:
-        path: of the published file, from the root of the repository.
+        name: of the published file in docs/measured.
     """
-    found = json.loads((ROOT / path).read_text(encoding="utf-8"))
+    found = json.loads((MEASURED / name).read_text(encoding="utf-8"))
     lines = [f"| | contender | {found['unit']} | times as fast |", "|---|---|---|---|"]
     for work, contenders in found["rows"].items():
         anchor = next(iter(contenders.values()))
@@ -32,13 +32,13 @@ def timings_block(path: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def measured_block(path: str) -> str:
+def measured_block(name: str) -> str:
     """The sentences and tables that `publish` has written.
 
     Args:
-        path: of the file, from the root of the repository.
+        name: of the file in docs/measured.
     """
-    parts = json.loads((ROOT / path).read_text(encoding="utf-8"))
+    parts = json.loads((MEASURED / name).read_text(encoding="utf-8"))
     return "\n\n".join(part if isinstance(part, str) else _table(part) for part in parts) + "\n"
 
 

@@ -46,7 +46,7 @@ FAULTS: Mapping[str, Fault] = {
         "Pardo et al. (2018), Time limits in reinforcement learning, section 3",
     ),
     "target-never-copied": Fault(
-        "The target network is never updated: what is learnt does not travel back.",
+        "The target network is never updated: values do not propagate.",
         "Mnih et al. (2015), algorithm 1: every C steps reset Q^ = Q",
     ),
     "discount-twice": Fault(
@@ -69,7 +69,7 @@ FAULTS: Mapping[str, Fault] = {
         f"{BOOK}, section 6.4, equation 6.7",
     ),
     "stale-buffer": Fault(
-        "It goes on learning from old steps that should have been replaced.",
+        "It still learns from old steps that should have been replaced.",
         "Mnih et al. (2015), algorithm 1: memory of capacity N; for rollouts Schulman et al. "
         "(2017), algorithm 1",
     ),
@@ -115,7 +115,7 @@ FAULTS: Mapping[str, Fault] = {
         "Stable-Baselines3: BaseAlgorithm.set_random_seed; NumPy enhancement proposal 19",
     ),
     "zip-forgets-tables": Fault(
-        "What was learnt is not in the saved file.", "Stable-Baselines3: BaseAlgorithm.save"
+        "The learnt values are missing from the saved file.", "Stable-Baselines3: BaseAlgorithm.save"
     ),
     "zip-forgets-optimizer": Fault(
         "The optimizer's state is not in the saved file: training continues differently.",

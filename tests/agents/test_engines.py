@@ -269,8 +269,8 @@ def test_an_environment_of_ones_own_ends_in_the_same_bits_if_it_draws_as_toy_tex
     assert models[1].engine_in_use == "compiled"
     np.testing.assert_array_equal(*(model.policy.q_table for model in models))
     words = {
-        "auto": "interpreted: the environment draws in its own way, so that compiled training is "
-        "equal in distribution only (engine: compiled takes that)",
+        "auto": "interpreted: the environment draws in its own way. Compiled training would be "
+        "equal in distribution only (engine: compiled accepts that)",
         "compiled": "compiled, not bit for bit: the environment draws in its own way",
     }
     tables, expected = [], transition_model(Backwards()).expected_reward

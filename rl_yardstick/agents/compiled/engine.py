@@ -295,8 +295,8 @@ def choose_engine(
     if not draws_alike(agent.env):
         if agent.engine == "auto":
             agent.engine_in_use = (
-                "interpreted: the environment draws in its own way, so that compiled training "
-                "is equal in distribution only (engine: compiled takes that)"
+                "interpreted: the environment draws in its own way. Compiled training would be "
+                "equal in distribution only (engine: compiled accepts that)"
             )
             return None
         agent.engine_in_use = "compiled, not bit for bit: the environment draws in its own way"

@@ -205,7 +205,7 @@ class EnvStates:
         """A state with this observation: ``state`` if its observation fits, else the first such."""
         fits = (self.seen.table == shown.astype(np.float32)).all(axis=1)
         if not fits.any():
-            raise ValueError("no state has the observation that the training is to go on from")
+            raise ValueError("no state has the observation from which to resume the training")
         return state if fits[state] else int(np.argmax(fits))
 
     def read(self) -> None:

@@ -354,7 +354,7 @@ class RMax(ModelKeeper, OptimisticAlgorithm):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         if self.gamma == 1:
-            raise ValueError("gamma must be below 1, so that planning comes to an end")
+            raise ValueError("gamma must be below 1: with 1, planning would not end")
 
     @property
     def outcomes_kept(self) -> int:  # type: ignore[override]

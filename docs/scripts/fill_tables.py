@@ -1,0 +1,87 @@
+"""Fills the generated tables of pages in docs/, between two comments, from code and measurements.
+
+    python docs/scripts/fill_tables.py            # writes the pages anew
+    python docs/scripts/fill_tables.py --check    # fails where a table is not up to date
+
+A table stands between ``<!-- kind: arguments -->`` and ``<!-- end -->``. The kinds: ``facts``, with
+an environment's id and arguments, for its picture and its figures; ``optima`` and ``variants``, with
+several ids, for their optima; ``hardness``, with several ids; ``agents`` and ``agents-by-spaces``;
+``measured``, with a file of docs/measured that a benchmark has published; ``timings``, with a file
+of `benchmarks/timing.py`.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(DOCS.parent), str(DOCS / "scripts")]
+
+from agent_tables import agents_block, by_spaces_block  # noqa: E402
+from environment_facts import (  # noqa: E402
+    facts_block,
+    hardness_block,
+    optima_block,
+    variants_block,
+)
+from measured_tables import measured_block, timings_block  # noqa: E402
+
+KINDS: dict[str, Callable[..., str]] = {
+    "agents": agents_block,
+    "agents-by-spaces": by_spaces_block,
+    "facts": facts_block,
+    "hardness": hardness_block,
+    "measured": measured_block,
+    "optima": optima_block,
+    "timings": timings_block,
+    "variants": variants_block,
+}
+BLOCK = re.compile(
+    rf"<!-- (?P<kind>{'|'.join(KINDS)})(?:: (?P<arguments>.*?))? -->\n(?P<table>.*?)<!-- end -->",
+    re.DOTALL,
+)
+
+
+def filled(text: str) -> str:
+    """The text of a page with its tables made anew."""
+
+    def fill(block: re.Match[str]) -> str:
+        made = KINDS[block["kind"]](*(block["arguments"] or "").split())
+        opening = block[0][: block.start("table") - block.start()]
+        return f"{opening}{made.strip()}\n<!-- end -->"
+
+    return BLOCK.sub(fill, text)
+
+
+def pages() -> Iterator[Path]:
+    """The pages that have a generated table."""
+    for path in sorted(DOCS.rglob("*.md")):
+        if BLOCK.search(path.read_text(encoding="utf-8")):
+            yield path
+
+
+def requested(*kinds: str) -> list[list[str]]:
+    """The arguments of all tables of some kinds."""
+    blocks = (each for path in pages() for each in BLOCK.finditer(path.read_text(encoding="utf-8")))
+    return [each["arguments"].split() for each in blocks if each["kind"] in kinds]
+
+
+def main() -> None:
+    """Fill or check all pages."""
+    stale = []
+    for path in pages():
+        text = path.read_text(encoding="utf-8")
+        if (new := filled(text)) != text:
+            stale.append(path.relative_to(DOCS.parent).as_posix())
+            if "--check" not in sys.argv:
+                path.write_text(new, encoding="utf-8")
+                print(f"filled {stale[-1]}")
+    if stale and "--check" in sys.argv:
+        sys.exit(f"not up to date: {', '.join(stale)}; run python docs/scripts/fill_tables.py")
+
+
+if __name__ == "__main__":
+    main()
