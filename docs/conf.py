@@ -28,7 +28,7 @@ extensions = [
     "site_contents",
     "site_docstrings",
 ]
-exclude_patterns = ["_ext", "images", "measured", "scripts"]
+exclude_patterns = ["_ext", "decisions", "images", "measured", "scripts"]
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
@@ -46,6 +46,9 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 300  # of a cell, on a busy machine that has compiled nothing yet
 nb_merge_streams = True
 nb_render_markdown_format = "myst"  # it has tables
+
+# Blocks without a language are outputs.
+highlight_language = "text"
 
 # Docstrings have their names between single backticks.
 default_role = "literal"

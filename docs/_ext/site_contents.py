@@ -8,30 +8,28 @@ from sphinx.application import Sphinx
 
 # First pages of folders, and the prefix of the names of the other pages there. Pages to which the
 # first page links come first, in the order of the links.
-FOLDERS = {
-    "algorithms": "algorithms/",
-    "environments": "environments/",
-    "decisions/README": "0",
-    "lessons/index": "0",
+FOLDERS = {"algorithms": "algorithms/", "environments": "environments/", "lessons/index": "0"}
+# Pages that the navigation shows below another.
+BELOW = {
+    "training": ["run-folder", "watching", "masks", "model-files", "cluster"],
+    "compare": ["statistics", "library-vs-hand-rolled", "why-better"],
+    "explain": ["critics", "audit", "shaping"],
+    "environments": ["partial-observability"],
 }
-# The placeholder in index.md for the pages that index.md does not name.
-REST = "every-other-page"
 
 
 def read(app: Sphinx, page: str, source: list[str]) -> None:
-    """Add the list of pages to the first page of a folder, and all other pages to the index."""
+    """Add the list of the pages below a page."""
+    names = BELOW.get(page, [])
     if page in FOLDERS:
         linked = re.findall(rf"\]\(({FOLDERS[page]}[\w-]+)\.md", source[0])
         above = page.rpartition("/")[0]
         start = f"{above}/" * bool(above)
         inside = [name.removeprefix(start) for name in app.env.found_docs if name.startswith(start)]
         others = sorted(name for name in inside if name.startswith(FOLDERS[page]))
-        names = "\n".join(dict.fromkeys([*linked, *others]))
-        source[0] += f"\n```{{toctree}}\n:hidden:\n{names}\n```\n"
-    if page == "index":
-        named = set(source[0].split())
-        found = {name for name in app.env.found_docs if "/" not in name} - {"index"}
-        source[0] = source[0].replace(REST, "\n".join(sorted(found - named)))
+        names = list(dict.fromkeys([*linked, *others, *names]))
+    if names:
+        source[0] += "\n```{toctree}\n:hidden:\n" + "\n".join(names) + "\n```\n"
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -1,4 +1,4 @@
-"""Fills the generated tables of pages in docs/, between two comments, from code and measurements.
+"""Fills the generated tables of README and docs, between two comments, from code and measurements.
 
     python docs/scripts/fill_tables.py            # writes the pages anew
     python docs/scripts/fill_tables.py --check    # fails where a table is not up to date
@@ -12,13 +12,17 @@ of `benchmarks/timing.py`.
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(DOCS.parent), str(DOCS / "scripts")]
+ROOT = DOCS.parent
+sys.path[:0] = [str(ROOT), str(DOCS / "scripts")]
 
 from agent_tables import agents_block, by_spaces_block  # noqa: E402
 from environment_facts import (  # noqa: E402
@@ -29,6 +33,23 @@ from environment_facts import (  # noqa: E402
 )
 from measured_tables import measured_block, timings_block  # noqa: E402
 
+
+
+def output_block(python: str, script: str, *words: str) -> str:
+    """What a command of the checkout prints, as a block of text."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"}
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(
+            [sys.executable, str(ROOT / script), *words],
+            cwd=folder,
+            env=environment,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+    return f"```text\n{done.stdout.strip()}\n```\n"
+
+
 KINDS: dict[str, Callable[..., str]] = {
     "agents": agents_block,
     "agents-by-spaces": by_spaces_block,
@@ -36,6 +57,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "hardness": hardness_block,
     "measured": measured_block,
     "optima": optima_block,
+    "output": output_block,
     "timings": timings_block,
     "variants": variants_block,
 }
@@ -45,10 +67,12 @@ BLOCK = re.compile(
 )
 
 
-def filled(text: str) -> str:
-    """The text of a page with its tables made anew."""
+def filled(text: str, *, outputs: bool = True) -> str:
+    """The text of a page with its tables made anew; without ``outputs``, those stay."""
 
     def fill(block: re.Match[str]) -> str:
+        if block["kind"] == "output" and not outputs:
+            return block[0]
         made = KINDS[block["kind"]](*(block["arguments"] or "").split())
         opening = block[0][: block.start("table") - block.start()]
         return f"{opening}{made.strip()}\n<!-- end -->"
@@ -58,7 +82,7 @@ def filled(text: str) -> str:
 
 def pages() -> Iterator[Path]:
     """The pages that have a generated table."""
-    for path in sorted(DOCS.rglob("*.md")):
+    for path in (ROOT / "README.md", *sorted(DOCS.rglob("*.md"))):
         if BLOCK.search(path.read_text(encoding="utf-8")):
             yield path
 
@@ -71,15 +95,15 @@ def requested(*kinds: str) -> list[list[str]]:
 
 def main() -> None:
     """Fill or check all pages."""
-    stale = []
+    stale, checks = [], "--check" in sys.argv
     for path in pages():
         text = path.read_text(encoding="utf-8")
-        if (new := filled(text)) != text:
-            stale.append(path.relative_to(DOCS.parent).as_posix())
-            if "--check" not in sys.argv:
+        if (new := filled(text, outputs=not checks)) != text:
+            stale.append(path.relative_to(ROOT).as_posix())
+            if not checks:
                 path.write_text(new, encoding="utf-8")
                 print(f"filled {stale[-1]}")
-    if stale and "--check" in sys.argv:
+    if stale and checks:
         sys.exit(f"not up to date: {', '.join(stale)}; run python docs/scripts/fill_tables.py")
 
 
