@@ -28,7 +28,7 @@ extensions = [
     "site_contents",
     "site_docstrings",
 ]
-exclude_patterns = ["_ext", "images", "measured", "scripts"]
+exclude_patterns = ["_ext", "decisions", "images", "measured", "scripts"]
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3

@@ -11,7 +11,6 @@ from sphinx.application import Sphinx
 FOLDERS = {
     "algorithms": "algorithms/",
     "environments": "environments/",
-    "decisions/README": "0",
     "lessons/index": "0",
 }
 # The placeholder in index.md for the pages that index.md does not name.
