@@ -8,10 +8,9 @@ The kinds of blocks: ``code``, with names that the linked file defines; ``enviro
 and arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, with the
 same arguments, for one part only; ``optima`` and ``variants``, with several ids, for tables of
 optima; ``hardness``, with several ids, for a table of their hardness; ``agents`` and
-``agents-by-spaces`` for tables of agents; ``flags``, with the name of a command; ``trainings`` for
-a table of commands with their results; ``reference``, with a module and optional names in it, for
-their docstrings below a heading; ``measured`` for a linked file that a benchmark has published;
-``timings``, the same for a file of `benchmarks/timing.py`.
+``agents-by-spaces`` for tables of agents; ``flags``, with the name of a command; ``reference``, with
+a module and optional names in it, for their docstrings below a heading; ``measured`` for a linked
+file that a benchmark has published; ``timings``, the same for a file of `benchmarks/timing.py`.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from environment_facts import (  # noqa: E402
     variants_block,
 )
 from measured_tables import measured_block, timings_block  # noqa: E402
-from recommended_commands import trainings_block, with_outcomes  # noqa: E402
+from recommended_commands import with_outcomes  # noqa: E402
 
 
 def reference_block(module: str, *names: str) -> str:
@@ -61,7 +60,6 @@ KINDS: dict[str, Callable[..., str]] = {
     "optima": optima_block,
     "reference": reference_block,
     "timings": timings_block,
-    "trainings": trainings_block,
     "variants": variants_block,
 }
 LINE = re.compile(rf'^\[[^\]\n]*\]\((\S+) "({"|".join(KINDS)})(?:: ([^"\n]*))?"\)$', re.MULTILINE)
