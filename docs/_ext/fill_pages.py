@@ -8,9 +8,10 @@ The kinds of blocks: ``code``, with names that the linked file defines; ``enviro
 and arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, with the
 same arguments, for one part only; ``optima`` and ``variants``, with several ids, for tables of
 optima; ``hardness``, with several ids, for a table of their hardness; ``agents`` and
-``agents-by-spaces`` for tables of agents; ``flags``, with the name of a command; ``reference``, with
-a module and optional names in it, for their docstrings below a heading; ``measured`` for a linked
-file that a benchmark has published; ``timings``, the same for a file of `benchmarks/timing.py`.
+``agents-by-spaces`` for tables of agents; ``flags``, with the name of a command; ``reference``,
+with a module and optional names in it, for their docstrings below a heading; ``measured`` for a
+linked file that a benchmark has published; ``timings``, the same for a file of
+`benchmarks/timing.py`.
 """
 
 from __future__ import annotations
