@@ -30,7 +30,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT / "docs" / "scripts"))
 
-from recommended_commands import PAGE, RESULTS, trainings, with_outcomes  # noqa: E402
+from recommended_commands import RESULTS, trainings, with_outcomes  # noqa: E402
 
 SEEDS = range(1000, 1020)
 FEWEST = 5
@@ -135,7 +135,7 @@ def fill(found: dict[str, Any]) -> None:
     rows = {one: row(one, found[one]) if one in found else before.get(one) for one in trainings()}
     lines = [f"{json.dumps(one)}: {json.dumps(each)}" for one, each in rows.items() if each]
     RESULTS.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
-    for page in PAGE.parent.rglob("*.md"):
+    for page in RESULTS.parent.rglob("*.md"):
         page.write_text(with_outcomes(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 

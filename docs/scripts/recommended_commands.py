@@ -16,8 +16,7 @@ from itertools import product
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "documented-commands.md"
-RESULTS = PAGE.with_suffix(".json")
+RESULTS = ROOT / "docs" / "documented-commands.json"
 # Where a command ends: a backtick, a comment, a cell of a table or the line.
 COMMAND = re.compile(
     r"(?:python (?:~/yardstick/)?(train|compare|tune)\.py|\byardstick (train|compare|tune)"
@@ -90,9 +89,7 @@ def _without(words: list[str], flags: dict[str, int]) -> list[str]:
 @cache
 def documented() -> tuple[Command, ...]:
     """All distinct commands of the text, in the order in which they are found."""
-    pages = [
-        p for p in sorted(ROOT.glob("docs/**/*.md")) if p != PAGE and "decisions" not in p.parts
-    ]
+    pages = [p for p in sorted(ROOT.glob("docs/**/*.md")) if "decisions" not in p.parts]
     code = sorted((ROOT / "rl_yardstick").rglob("*.py"))
     found: dict[Command, Command] = {}
     for path in (ROOT / "README.md", *pages, *sorted(ROOT.glob("*.py")), *code):
@@ -150,15 +147,6 @@ def reached() -> dict[str, Reached]:
         count, n = (int(n_solved), int(n_runs)) if row["solved"] else (None, 0)
         found[training] = Reached(count, n, row["median"], row["seconds"])
     return found
-
-
-def trainings_block() -> str:
-    """A row for each training."""
-    lines = ["| `train.py` with | solved | median score | seconds |", "|---|---|---|---|"]
-    for training, row in reached().items():
-        solved = "" if row.n_solved is None else f"{row.n_solved} of {row.n_runs}"
-        lines.append(f"| `{training}` | {solved} | {row.median} | {row.seconds:g} |")
-    return "\n".join(lines) + "\n"
 
 
 def with_outcomes(text: str) -> str:

@@ -1,8 +1,8 @@
 """Counts lines and files against the limits in CONTRIBUTING.md: ``python docs/scripts/sizes.py``.
 
-The limits are only in the table there under "Size". A row names, in code marks, folders (whose
-Python files count) or patterns; the row "together" is the sum of the rows above it. Only files
-under version control count. It fails if a limit is exceeded.
+Of Markdown it counts words instead of lines. The limits are only in the table there under "Size". A
+row names, in code marks, folders (whose Python files count) or patterns; the row "together" is the
+sum of the rows above it. Only files under version control count. It fails if a limit is exceeded.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def main() -> int:
 
 
 def lengths_of_files(root: Path) -> dict[str, int]:
-    """The number of lines of each Python, Markdown or TOML file under version control, by path."""
+    """Lines of each Python or TOML file and words of each Markdown file under version control."""
     listing = subprocess.run(
         ["git", "ls-files", "-z", "*.py", "*.md", "*.toml"],
         cwd=root,
@@ -68,7 +68,11 @@ def lengths_of_files(root: Path) -> dict[str, int]:
         check=True,
     )
     paths = [path for path in listing.stdout.split("\0") if (root / path).is_file()]
-    return {path: len((root / path).read_bytes().splitlines()) for path in paths}
+    contents = {path: (root / path).read_bytes() for path in paths}
+    return {
+        path: len(content.split() if path.endswith(".md") else content.splitlines())
+        for path, content in contents.items()
+    }
 
 
 def read_limits(text: str) -> list[Limit]:

@@ -316,7 +316,7 @@ def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Training
     say(console, "\n".join(["", *results]) if results else "")
     exact = outcome.judge.exact
     if exact and outcome.final and (told := exact.instead(outcome.agent, outcome.final)):
-        say(console, f"instead  {told}\nmore     docs/not-learning.md")
+        say(console, f"instead  {told}\nmore     docs/explain.md")
     say(console, "\n".join(["", *next_commands(run, spec.gym_packages, outcome)]))
     if outcome.watch is not None and spec.watch_learning is not None:
         from rl_yardstick.report.page.learning import write_learning_page

@@ -1,7 +1,7 @@
 """How hard a decision process is to learn: measures that follow from its model alone.
 
 All are exact up to rounding, except the effective horizon, which is a bound. Episodes have a time
-limit, returns are undiscounted, and random actions are uniform. `docs/hardness.md` explains the
+limit, returns are undiscounted, and random actions are uniform. `docs/evaluation.md` explains the
 measures, and which agents suffer from which.
 """
 

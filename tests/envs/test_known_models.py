@@ -207,7 +207,7 @@ def test_layers_other_layouts_and_names():
     assert state_name(gym.make("RiverSwim-v0"), None, 3) == "state 3"
 
 
-DOCUMENT = Path(train.__file__).parent / "docs" / "continuous.md"
+DOCUMENT = Path(train.__file__).parent / "docs" / "evaluation.md"
 KNOWN = brackets.known_entries().values()
 ENTRIES = {entry["id"]: entry for limits in KNOWN for entry in limits.values()}
 
