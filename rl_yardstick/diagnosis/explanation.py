@@ -303,7 +303,7 @@ class Found:
         if self.evaluator.masks is not None:
             ahead = np.where(self.evaluator.masks, ahead, -np.inf)
         seen = policy_return(self.model, ahead.argmax(axis=1), self.horizon).expected_return
-        yield "not settled", seen, "one exact look ahead with its own values"
+        yield "not settled", seen, "one greedy improvement of the agent"
 
     def best_of(self, values: Floats) -> float:
         """The return of the best policy whose actions are all greedy in some values (S, A)."""
