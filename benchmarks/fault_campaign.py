@@ -1,7 +1,7 @@
 """Stops and kills trainings and studies at random moments, until they are done.
 
     python benchmarks/fault_campaign.py --kills 30       # a look, a minute or two
-    python benchmarks/fault_campaign.py --kills 1000     # docs/reliability.md: half an hour
+    python benchmarks/fault_campaign.py --kills 1000     # docs/run-folder.md: half an hour
 
 Every agent is trained once undisturbed. Then the same command is started again and again, and gets
 a signal at a moment drawn uniformly from its duration: SIGKILL, SIGTERM, SIGINT, or SIGINT twice.

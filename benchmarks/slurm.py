@@ -2,7 +2,7 @@
 
     apt-get install slurm-wlm munge                      # Debian: 17 s
     python benchmarks/slurm.py --runs 8 --faults scancel preempt      # a look, a minute or two
-    python benchmarks/slurm.py                                        # docs/reliability.md
+    python benchmarks/slurm.py                                        # docs/run-folder.md
 
 The program starts munge, slurmctld and two slurmd in a temporary folder, and stops them at its end.
 The study's jobs are those of docs/cluster.md, but smaller. Faults come one by one while runs are
