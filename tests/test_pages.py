@@ -10,7 +10,7 @@ import pytest
 from rl_yardstick.agents import ALGORITHMS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-FORM = ["Idea", "Update", "The code", "By hand", "When it fails", "See it", "Source"]
+FORM = ["Idea", "Update", "Code", "Example", "Limitations", "Run", "Source"]
 
 
 @pytest.fixture(scope="module")
