@@ -44,6 +44,7 @@ style: $(STAMP)
 	$(BIN)/ruff check --preview --select PLW1514 rl_yardstick # Windows does not take text for UTF-8
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	$(BIN)/python docs/scripts/english.py
 
 types: $(STAMP)
 	$(BIN)/python -m mypy
@@ -65,6 +66,7 @@ docs: $(STAMP) ## Build the site, build/site/index.html, and check its links
 	rm -rf build/site
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/site
 	$(BIN)/python docs/scripts/check_links.py build/site
+	$(BIN)/python docs/scripts/fill_tables.py --check
 
 images: $(STAMP) ## Redraw the pictures of README and docs; one needs Chromium
 	$(BIN)/python docs/scripts/draw_images.py

@@ -16,48 +16,51 @@ FORM = ["Idea", "Update", "Code", "Example", "Limitations", "Run", "Source"]
 @pytest.fixture(scope="module")
 def fill_pages():
     before = list(sys.path)
-    sys.path.insert(0, str(DOCS / "_ext"))
+    sys.path[:0] = [str(DOCS / "_ext"), str(DOCS / "scripts")]
     yield importlib.import_module("fill_pages")
     sys.path[:] = before
 
 
-def test_pages_can_be_filled(fill_pages):
-    """`make docs` fills the dear ones too, in seconds to a minute."""
+@pytest.fixture(scope="module")
+def fill_tables(fill_pages):
+    return importlib.import_module("fill_tables")
+
+
+def test_pages_can_be_filled(fill_pages, fill_tables):
+    """`make docs` checks the dear tables too, in seconds to a minute."""
     dear = {"environments.md", "jacks-car-rental.md"}
     dear |= {"hallway.md", "racetrack.md", "dark-warehouse.md"}
     for path in sorted(path for path in DOCS.rglob("*.md") if path.name not in dear):
-        text = fill_pages.filled(path.read_text(), path.parent)
+        text = path.read_text()
+        assert fill_tables.filled(text, outputs=False) == text, path
+        text = fill_pages.filled(text, path.parent)
         assert not re.search(r"^\[[^\]]*\]\(\S+ \"[^\"]*\"\)$", text, re.MULTILINE), path
 
 
-def test_every_environment_is_pictured(fill_pages):
+def test_every_environment_is_pictured(fill_tables):
     drawn = {path.stem for path in (DOCS / "images" / "environments").glob("*.png")}
-    assert drawn == set(fill_pages.pictured_environments())
+    assert drawn == {env_id for env_id, *_ in fill_tables.requested("facts")}
 
 
-def test_the_table_of_hardness_has_each_environment_with_a_model(fill_pages):
-    page = (DOCS / "environments.md").read_text()
-    listed = {
-        kind: " ".join(
-            arguments for _, other, arguments in fill_pages.LINE.findall(page) if other == kind
-        )
-        for kind in ("optima", "hardness")
-    }
-    own = {item.partition("=")[2] for item in listed["optima"].split()}
+def test_the_table_of_hardness_has_each_environment_with_a_model(fill_tables):
+    own = {item.partition("=")[2] for items in fill_tables.requested("optima") for item in items}
+    (listed,) = fill_tables.requested("hardness")
     without = {"GaussianBandit-v0", "LinearBandit-v0"}
-    assert own - without < set(listed["hardness"].split())
-    assert not without & set(listed["hardness"].split())
-    heads, _, row = fill_pages.filled('[x](x.py "hardness: DeepSea-v0")', DOCS).splitlines()
+    assert own - without < set(listed)
+    assert not without & set(listed)
+    text = fill_tables.filled("<!-- hardness: DeepSea-v0 -->\n<!-- end -->")
+    _, heads, _, row, _ = text.splitlines()
     worth = "55 of 101 | 9 | 22.2 % | 0.001 | 0.9945 | 0 | 1 | 10 | 10,240 | 10,240"
     assert row == f"| `DeepSea-v0` | {worth} |"
     assert heads.count("|") == row.count("|")
 
 
-def test_a_line_is_filled_and_others_stay(fill_pages):
+def test_a_block_is_filled_and_others_stay(fill_pages, fill_tables):
     with pytest.raises(ValueError, match=r"mdp/graph\.py defines no nothing"):
         fill_pages.filled('[x](../rl_yardstick/mdp/graph.py "code: nothing")', DOCS)
     other = 'See [code](x.py "code: f") and [a title](x.md "agents of ours").\n'
-    filled = fill_pages.filled(f'{other}[Agents](x.py "agents")\n', DOCS)
+    assert fill_pages.filled(other, DOCS) == other
+    filled = fill_tables.filled(f"{other}<!-- agents -->\n<!-- end -->\n")
     assert filled.startswith(other)
     assert all(f"`{name}`" in filled for name in ALGORITHMS)
 

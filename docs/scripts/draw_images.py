@@ -20,7 +20,7 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parents[1]
 ROOT = DOCS.parent
 IMAGES = DOCS / "images"
-sys.path[:0] = [str(ROOT), str(DOCS / "_ext")]
+sys.path[:0] = [str(ROOT), str(DOCS / "scripts")]
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 WIDEST = 560  # pixels, of an environment
@@ -52,11 +52,13 @@ def draw_environments() -> None:
     from PIL import Image
 
     import rl_yardstick.envs  # noqa: F401  # registers them
-    from fill_pages import pictured_environments
+    from fill_tables import requested
+    from rl_yardstick.pipeline.settings import parse_assignments
 
     folder = IMAGES / "environments"
     folder.mkdir(exist_ok=True)
-    for env_id, kwargs in pictured_environments().items():
+    for env_id, *arguments in requested("facts"):
+        kwargs = parse_assignments(arguments, env_id)
         env = gym.make(env_id, render_mode="rgb_array", **kwargs)
         env.reset(seed=0)
         picture = Image.fromarray(env.render())  # type: ignore[arg-type]
