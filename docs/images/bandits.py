@@ -62,7 +62,7 @@ def draw_regret() -> None:
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("clicks lost")
     axes[0].legend(fontsize=9, loc="upper left")
-    figure.savefig(FOLDER / "bandit-regret.png", dpi=90)
+    figure.savefig(FOLDER / "bandit-segments.png", dpi=90)
 
 
 def after_test(rates: Floats, by_segment: bool) -> Floats:

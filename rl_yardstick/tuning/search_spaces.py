@@ -1,7 +1,7 @@
 """Search spaces: read from files, sampled by Optuna, and inverted from settings to parameters.
 
 ``hyperparams/search_spaces/ALGO.yml`` maps environment ids to ranges and choices, see
-`docs/search-spaces.md`. An environment's entry overrides ``default`` name by name; null removes a
+`docs/tuning.md`. An environment's entry overrides ``default`` name by name; null removes a
 name.
 
 Each dimension of a space converts between its settings and the parameters that Optuna stores for
@@ -428,7 +428,7 @@ def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
 
 
 def _dimension(name: str, said: Any, place: str) -> Dimension:
-    """Read the value of a name: a list, or a mapping as described in `docs/search-spaces.md`."""
+    """Read the value of a name: a list, or a mapping as described in `docs/tuning.md`."""
     said = {"choices": said} if isinstance(said, list) else said
     if not isinstance(said, dict):
         raise UserError(

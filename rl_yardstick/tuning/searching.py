@@ -110,7 +110,7 @@ def outcomes_of(trial: FrozenTrial) -> dict[int, RunOutcome]:
     return {int(seed): RunOutcome(**run) for seed, run in trial.user_attrs.get(RUNS, {}).items()}
 
 
-# --- hopeless trials; docs/search-spaces.md reports the savings and the errors of ending them -----
+# --- hopeless trials; docs/tuning.md has the rules ------------------------------------------------
 
 Scores = Mapping[int, float]  # by seed
 Value = Callable[[Sequence[float]], float]  # of several scores

@@ -160,7 +160,7 @@ def judge(
     Raises:
         ValueError: for a level, a margin or a number of looks out of range.
 
-    Source: Welch (1947); Schuirmann (1987); Holm (1979). docs/statistics.md has the titles.
+    Source: Welch (1947); Schuirmann (1987); Holm (1979). docs/statistics.md has the journals.
     """
     n_looks = len(looks) or n_looks
     if not (0 < level < 0.5 and n_looks >= 1):
