@@ -14,7 +14,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs.known_models import (
     observations_of_states,
     success_outcomes,
@@ -32,7 +31,7 @@ from rl_yardstick.mdp import (
 from rl_yardstick.mdp.beliefs import Bracket
 from rl_yardstick.mdp.evaluation import PolicyReturn
 from rl_yardstick.pipeline.evaluation.exact import HiddenScale, hidden_scale
-from rl_yardstick.pipeline.settings import entry_names, parse_assignments
+from rl_yardstick.pipeline.settings import parse_assignments
 
 PAGES = Path(__file__).resolve().parents[1] / "environments"
 HARDNESS_HEADS = (
@@ -166,22 +165,21 @@ def facts_table(env_id: str, *arguments: str) -> str:
     rows = {
         "observations": f"`{env.observation_space}`",
         "actions": f"`{env.action_space}`",
-        "time limit": f"{limit:,} steps" if limit else f"none; commands set {LIMIT:,} steps",
+        "time limit": f"{limit:,} steps" if limit else f"{LIMIT:,} steps, set by commands",
     }
     model, found = transition_model(env), solution(env_id, *arguments)
     if model is None or found is None:
-        rows["model"] = "not known: what agents are worth is sampled"
+        rows["model"] = "unknown: returns are sampled"
     else:
         rows |= {
-            "states that can be reached": f"{model.reachable.sum():,}",
+            "reachable states": f"{model.reachable.sum():,}",
             "transitions": "random" if is_random(model) else "deterministic",
-            "rewards of a step": rewards(model),
-            "**optimum**: the highest expected return": f"**{number(found.optimum)}**",
+            "rewards": rewards(model),
+            "**optimum**": f"**{number(found.optimum)}**",
             **by_observation(found.by_observation),
-            "the best policy of one action throughout": number(found.best_constant),
+            "best constant action": number(found.best_constant),
             "random actions": random_actions(found.random),
         }
-    rows["settings are shipped for"] = agents_with_settings(env_id)
     return "| | |\n|---|---|\n" + "\n".join(f"| {key} | {said} |" for key, said in rows.items())
 
 
@@ -190,7 +188,7 @@ def by_observation(scale: HiddenScale | None) -> dict[str, str]:
     if scale is None:
         return {}
     said = " and ".join(observed(scale))
-    return {"the highest by what is observed, where a score is 1": f"**{said}**"}
+    return {"optimum by observations (score 1)": f"**{said}**"}
 
 
 @dataclass(frozen=True)
@@ -249,12 +247,6 @@ def number(value: float) -> str:
     if abs(value - round(value)) < 1e-9:
         return f"{round(value):,}"
     return f"{value:,.2f}" if abs(value) >= 10 else f"{value:.4g}"
-
-
-def agents_with_settings(env_id: str) -> str:
-    """The agents in whose file of hyperparameters the environment has an entry."""
-    found = [f"`{name}`" for name in ALGORITHMS if env_id in entry_names(name)]
-    return ", ".join(found) or "no agent; those that fit have default ones"
 
 
 def docstring_sections(cls: Any) -> list[str]:
