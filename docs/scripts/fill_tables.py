@@ -39,8 +39,10 @@ def output_block(python: str, script: str, *words: str) -> str:
     """What a command of the checkout prints, as a block of text."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"}
     with tempfile.TemporaryDirectory() as folder:
+        for path in ROOT.glob("*.py"):
+            (Path(folder) / path.name).symlink_to(path)
         done = subprocess.run(
-            [sys.executable, str(ROOT / script), *words],
+            [sys.executable, script, *words],
             cwd=folder,
             env=environment,
             check=True,
