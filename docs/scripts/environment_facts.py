@@ -35,8 +35,8 @@ from rl_yardstick.pipeline.settings import parse_assignments
 
 PAGES = Path(__file__).resolve().parents[1] / "environments"
 HARDNESS_HEADS = (
-    *("states", "diameter", "pairs", "smallest gap", "mean gap", "variance", "look-ahead"),
-    *("effective horizon", "random actions to a reward", "to the goal"),
+    *("states", "diameter", "smallest gap", "look-ahead", "effective horizon"),
+    *("random actions to a reward", "to the goal"),
 )
 LIMIT = 1000  # the commands' time limit for an environment without one
 MOST_REWARDS = 8
@@ -133,10 +133,7 @@ def hardness_cells(env_id: str) -> dict[str, str]:
     cells = [
         f"{found.reachable_states:,}" + (f" of {found.states:,}" if unreached else ""),
         cell(found.diameter),
-        "-" if found.connected is None else f"{100 * found.connected:.3g} %",
         cell(found.smallest_gap),
-        cell(found.mean_gap),
-        cell(found.return_variance),
         cell(found.lookahead),
         "-" if bound is None else f"{bound:.1f}".removesuffix(".0"),
         cell(found.random_steps_to_reward),
