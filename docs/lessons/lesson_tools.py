@@ -24,14 +24,14 @@ def draw_curves(
         dashed: further heights by label, or single numbers.
         **axes: properties of the axes, such as ``xlabel`` and ``ylim``.
     """
-    _, drawn = plt.subplots(figsize=(7, 4))
+    figure, drawn = plt.subplots(figsize=(8, 4), layout="constrained")
     places = np.arange(len(next(iter(curves.values())))) if x is None else np.asarray(x)
     for label, curve in curves.items():
         drawn.plot(places, curve, label=label)
     for label, curve in (dashed or {}).items():
         drawn.plot(places, np.broadcast_to(curve, places.shape), "k--", label=label)
     drawn.set(**axes)
-    drawn.legend()
+    figure.legend(loc="outside right upper")
     plt.show()
 
 
