@@ -75,7 +75,7 @@ def filled(text: str, *, outputs: bool = True) -> str:
     def fill(block: re.Match[str]) -> str:
         if block["kind"] == "output" and not outputs:
             return block[0]
-        made = KINDS[block["kind"]](*(block["arguments"] or "").split())
+        made = KINDS[block["kind"]](*(block["arguments"] or "").strip("`").split())
         opening = block[0][: block.start("table") - block.start()]
         return f"{opening}{made.strip()}\n<!-- end -->"
 
