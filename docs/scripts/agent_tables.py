@@ -40,7 +40,7 @@ def by_spaces_block() -> str:
 
 def agents_block() -> str:
     """A row for each agent."""
-    lines = ["| agent | what it is | observes | acts in | needs |", "|---|---|---|---|---|"]
+    lines = ["| agent | what it is | observes → acts in |", "|---|---|---|"]
     for name, entry in ALGORITHMS.items():
         needs = [
             "a bandit" if entry.for_bandits else "",
@@ -48,14 +48,10 @@ def agents_block() -> str:
             f"observations of shape {entry.observation_shape}" if entry.observation_shape else "",
             f"the extra `{entry.extra}`" if entry.extra else "",
         ]
-        cells = (
-            linked([name]),
-            entry.summary,
-            ", ".join(entry.observations),
-            ", ".join(entry.actions),
-            ", ".join(filter(None, needs)),
-        )
-        lines.append("| " + " | ".join(cells) + " |")
+        told = ", ".join(filter(None, needs))
+        what = f"{entry.summary} (needs {told})" if told else entry.summary
+        spaces_of = f"{'/'.join(entry.observations)} → {'/'.join(entry.actions)}"
+        lines.append(f"| {linked([name])} | {what} | {spaces_of} |")
     return "\n".join(lines) + "\n"
 
 
