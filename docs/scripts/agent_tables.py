@@ -43,7 +43,6 @@ def agents_block() -> str:
     lines = ["| agent | what it is | observes → acts in |", "|---|---|---|"]
     for name, entry in ALGORITHMS.items():
         needs = [
-            "a bandit" if entry.for_bandits else "",
             "action masks" if entry.needs_masks else "",
             f"observations of shape {entry.observation_shape}" if entry.observation_shape else "",
             f"the extra `{entry.extra}`" if entry.extra else "",
