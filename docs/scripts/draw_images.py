@@ -31,30 +31,25 @@ HEADLINE = {
     "FrozenLake8x8-v1_intervals.png": "lake8x8-intervals.png",
     "performance_profiles.png": "profiles.png",
 }
+DOTS: dict[str, Any] = {"markersize": 4.5, "markeredgewidth": 0, "alpha": 0.5}
+FALLING, OPTIMISTIC, LEARNT = "falling step size", "optimistic values", "last step learnt"
+SMALL_STEPS = "johnnycode8 with step size 0.1, discount 0.99"
 # Rows of docs/images/tutorials.png: an environment of studies/tutorials.yml, and, where its runs
 # miss the optimum, a change, and the agent and the environment that have it (empty: the same).
-DOTS: dict[str, Any] = {"markersize": 4.5, "markeredgewidth": 0, "alpha": 0.5}
-DRY, LEARNT = "Gymnasium, dry lake 11x11", "last step learnt"
 TUTORIALS: dict[str, tuple[str, ...]] = {
     "Hugging Face, dry lake": (),
-    DRY: ("optimistic values", "optimistic values", DRY),
-    "Hugging Face's lake settings on ice": ("falling step size", "falling step size", ""),
-    "Gymnasium's lake settings on ice": ("falling step size", "falling step size", ""),
-    "Juliani, ice": ("optimistic values", "optimistic values", ""),
-    "Simonini, ice": ("falling step size\nand optimistic values", "both", ""),
-    "deeplizard, ice": ("falling step size", "falling step size", ""),
-    "johnnycode8, ice 8x8": (
-        *("step size 0.1\nand discount 0.99", "as taught"),
-        "johnnycode8 with step size 0.1, discount 0.99",
-    ),
+    "Gymnasium, dry lake 11x11": (OPTIMISTIC, OPTIMISTIC, ""),
+    "Hugging Face's lake settings on ice": (FALLING, FALLING, ""),
+    "Gymnasium's lake settings on ice": (FALLING, FALLING, ""),
+    "Juliani, ice": (OPTIMISTIC, OPTIMISTIC, ""),
+    "Simonini, ice": (f"{FALLING}\nand {OPTIMISTIC}", "both", ""),
+    "deeplizard, ice": (FALLING, FALLING, ""),
+    "johnnycode8, ice 8x8": ("step size 0.1\nand discount 0.99", "as taught", SMALL_STEPS),
     "LearnDataSci, Taxi": (),
     "Simonini, Taxi": (),
     "Hugging Face, Taxi": (),
-    "Gymnasium, Taxi": (LEARNT, "as taught", "Gymnasium, Taxi, last step learnt"),
-    "Gymnasium, Taxi with masks": (
-        *(LEARNT, "as taught"),
-        "Gymnasium, Taxi with masks, last step learnt",
-    ),
+    "Gymnasium, Taxi": (LEARNT, "as taught", f"Gymnasium, Taxi, {LEARNT}"),
+    "Gymnasium, Taxi with masks": (LEARNT, "as taught", f"Gymnasium, Taxi with masks, {LEARNT}"),
     "Britz, cliff": (),
 }
 SLIPPERY = ("slip:0.1", "shelf_reward:-5")
@@ -161,10 +156,13 @@ def draw_tutorials() -> None:
             axis.plot(dots, [middle + y for y in spread], "o", color=COLOURS[k], **DOTS)
         if change:
             axis.text(1.03, place + 0.2, change[0], va="center", color=COLOURS[1], fontsize=9)
+    for colour, label in zip(COLOURS, ("as taught", "with the change at the right"), strict=False):
+        axis.plot([], [], "o", color=colour, label=label, **DOTS)
+    axis.legend(loc="lower left", bbox_to_anchor=(0.05, 0.27), frameon=False)
     axis.axvline(1, color="black", lw=1)
     axis.text(1, -0.65, "optimum", ha="center", va="bottom", fontsize=9)
     axis.set_yticks(range(len(TUTORIALS)), [*TUTORIALS])
-    axis.set(ylim=(len(TUTORIALS) - 0.5, -0.6), xlim=(-0.1, 1.42), xticks=[0, 0.25, 0.5, 0.75, 1])
+    axis.set(ylim=(len(TUTORIALS) - 0.5, -0.6), xlim=(-0.6, 1.6), xticks=[-0.5, 0, 0.5, 1])
     axis.set_xlabel("score of a run: 0 the best random or constant policy, 1 the optimum")
     axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(IMAGES / "tutorials.png", dpi=100)
