@@ -16,6 +16,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 DOCS = Path(__file__).resolve().parents[1]
 ROOT = DOCS.parent
@@ -29,6 +30,27 @@ HEADLINE = {
     "Taxi-v4_learning_curves.png": "taxi-curves.png",
     "FrozenLake8x8-v1_intervals.png": "lake8x8-intervals.png",
     "performance_profiles.png": "profiles.png",
+}
+DOTS: dict[str, Any] = {"markersize": 4.5, "markeredgewidth": 0, "alpha": 0.5}
+FALLING, OPTIMISTIC, LEARNT = "falling step size", "optimistic values", "last step learnt"
+SMALL_STEPS = "johnnycode8 with step size 0.1, discount 0.99"
+# Rows of docs/images/tutorials.png: an environment of studies/tutorials.yml, and, where its runs
+# miss the optimum, a change, and the agent and the environment that have it (empty: the same).
+TUTORIALS: dict[str, tuple[str, ...]] = {
+    "Hugging Face, dry lake": (),
+    "Gymnasium, dry lake 11x11": (OPTIMISTIC, OPTIMISTIC, ""),
+    "Hugging Face's lake settings on ice": (FALLING, FALLING, ""),
+    "Gymnasium's lake settings on ice": (FALLING, FALLING, ""),
+    "Juliani, ice": (OPTIMISTIC, OPTIMISTIC, ""),
+    "Simonini, ice": (f"{FALLING}\nand {OPTIMISTIC}", "both", ""),
+    "deeplizard, ice": (FALLING, FALLING, ""),
+    "johnnycode8, ice 8x8": ("step size 0.1\nand discount 0.99", "as taught", SMALL_STEPS),
+    "LearnDataSci, Taxi": (),
+    "Simonini, Taxi": (),
+    "Hugging Face, Taxi": (),
+    "Gymnasium, Taxi": (LEARNT, "as taught", f"Gymnasium, Taxi, {LEARNT}"),
+    "Gymnasium, Taxi with masks": (LEARNT, "as taught", f"Gymnasium, Taxi with masks, {LEARNT}"),
+    "Britz, cliff": (),
 }
 SLIPPERY = ("slip:0.1", "shelf_reward:-5")
 
@@ -110,6 +132,45 @@ def copy_headline() -> None:
             print(f"no {folder / figure}: docs/images/{name} stays as it is")
 
 
+def draw_tutorials() -> None:
+    """The runs of studies/tutorials.yml as dots, if the study is in logs/studies/tutorials."""
+    import matplotlib as mpl
+    import pandas as pd
+
+    from rl_yardstick.report.series import COLOURS
+
+    table = ROOT / "logs" / "studies" / "tutorials" / "summary.csv"
+    if not table.exists():
+        print(f"no {table}: docs/images/tutorials.png stays as it is")
+        return
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    scores = pd.read_csv(table).groupby(["agent", "environment"])["score"]
+    figure, axis = plt.subplots(figsize=(9, 7), layout="constrained")
+    for place, (row, change) in enumerate(TUTORIALS.items()):
+        strips = [("as taught", row), *([(change[1], change[2] or row)] if change else [])]
+        for k, strip in enumerate(strips):
+            dots = scores.get_group(strip).to_numpy()
+            # Equal runs lie above one another.
+            spread = [0.3 * ((7 * n % len(dots)) / len(dots) - 0.5) for n in range(len(dots))]
+            middle = place + (0.4 * k - 0.2 if change else 0)
+            axis.plot(dots, [middle + y for y in spread], "o", color=COLOURS[k], **DOTS)
+        if change:
+            axis.text(1.03, place + 0.2, change[0], va="center", color=COLOURS[1], fontsize=9)
+    for colour, label in zip(COLOURS, ("as taught", "with the change at the right"), strict=False):
+        axis.plot([], [], "o", color=colour, label=label, **DOTS)
+    axis.legend(loc="lower left", bbox_to_anchor=(0.05, 0.27), frameon=False)
+    axis.axvline(1, color="black", lw=1)
+    axis.text(1, -0.65, "optimum", ha="center", va="bottom", fontsize=9)
+    axis.set_yticks(range(len(TUTORIALS)), [*TUTORIALS])
+    axis.set(ylim=(len(TUTORIALS) - 0.5, -0.6), xlim=(-0.6, 1.6), xticks=[-0.5, 0, 0.5, 1])
+    axis.set_xlabel("score of a run: 0 the best random or constant policy, 1 the optimum")
+    axis.spines[["top", "right"]].set_visible(False)
+    figure.savefig(IMAGES / "tutorials.png", dpi=100)
+    keep(IMAGES / "tutorials.png", "tutorials.png")
+
+
 def command(script: str, *words: str, folder: str) -> None:
     """Run one of the project's commands in a folder."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -131,6 +192,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "warehouse": draw_warehouse,
     "report": draw_report,
     "headline": copy_headline,
+    "tutorials": draw_tutorials,
 }
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 STUDIES = [
     path for path in sorted((ROOT / "studies").glob("*.yml")) if not path.name.startswith("bandit-")
 ]
-GUIDE = (ROOT / "docs" / "courses.md").read_text()
+GUIDE = "".join((ROOT / "docs" / name).read_text() for name in ("courses.md", "tutorials.md"))
 
 
 def shrunk(name, agents, environments="", **changes):
