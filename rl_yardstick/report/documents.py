@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import math
 import re
 import unicodedata
 from collections.abc import Callable, Mapping
@@ -22,7 +21,15 @@ from rl_yardstick.experiments.study import METRIC_WORDS
 from rl_yardstick.pipeline.errors import visible
 from rl_yardstick.pipeline.files import replacing, write_json, write_text
 from rl_yardstick.report import words
-from rl_yardstick.report.words import enumeration, interval, number, score_number, seed_sentence
+from rl_yardstick.report.words import (
+    duration,
+    enumeration,
+    interval,
+    number,
+    processor_seconds,
+    score_number,
+    seed_sentence,
+)
 
 # A markup is named by the suffix of its files and of its templates.
 Markup = Literal["md", "tex"]
@@ -248,23 +255,6 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
     metric = METRIC_WORDS[results.study.metric]
     caption = f"{environment.environment}: {metric}, with 95 % intervals over seeds."
     return Table(["", *kept], rows, caption)
-
-
-def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:
-    """Median CPU seconds of a run by agent and environment, if all their runs were measured."""
-    times = results.summary.astype({"cpu_seconds": float})
-    grouped = times.groupby(["agent", "environment"], sort=False)["cpu_seconds"]
-    medians = grouped.agg(lambda runs: runs.median(skipna=False)).dropna()
-    rows = medians.reset_index().itertuples(index=False)
-    return {(agent, environment): time for agent, environment, time in rows}
-
-
-def duration(time: float) -> str:
-    """Seconds with two significant digits."""
-    if time <= 0:
-        return "0 s"
-    digits = 1 - math.floor(math.log10(time))
-    return f"{round(time, digits):,.{max(digits, 0)}f} s"
 
 
 PAIR_COLUMNS = (

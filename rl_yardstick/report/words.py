@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 
 from rl_yardstick.experiments.analysis import MARK, ON_THE_SCALE, EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.plan import Seeds, TuningSeeds
-from rl_yardstick.experiments.study import METRIC_WORDS, OF_TRAINING, StudySpec
+from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import bracket_mark
@@ -23,7 +24,7 @@ from rl_yardstick.verdicts import Estimate, Pair, unseen_share
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.explanation import Explanation, StateLoss
     from rl_yardstick.experiments.plan import PlannedRun
-    from rl_yardstick.experiments.results import Tried
+    from rl_yardstick.experiments.results import StudyResults, Tried
 
 
 SIGNIFICANT = 4  # digits
@@ -264,17 +265,134 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
     return Conclusion(_lead(study, environment), pairs, tuple(notes))
 
 
-def overall_sentences(analysis: StudyAnalysis) -> list[str]:
-    """Who is best over all environments; nothing for a single one."""
-    overall = analysis.overall
-    if overall is None or overall.best is None or len(overall.scores) < 2:
-        return []
-    n = len(analysis.environments)
-    where = "Over both environments" if n == 2 else f"Over all {n} environments"
-    means = [(name, overall.scores[name].mean.point) for name in overall.best.agents]
-    told = [f"{name} {score_number(mean)}" for name, mean in means]
-    scores = f"mean score: {', '.join(told)}"
-    return [f"{where}, best: {overall.best}; {scores}.", *unproven_sentences(analysis.environments)]
+def answer(analysis: StudyAnalysis) -> list[str]:
+    """Who is best, how certain that is, what failed, and what it cost: short sentences."""
+    sentences, places = [*_standing(analysis)], analysis.environments
+    failed, n = Counter[str](), Counter[str]()
+    for agent in (agent for one in places for agent in one.agents):
+        failed[agent.agent] += agent.runs.failed or 0
+        n[agent.agent] += agent.runs.n
+    if told := [f"{k} of {n[name]:,} runs of {name}" for name, k in failed.most_common() if k]:
+        sentences.append(f"Failed: {_names(told)}.")
+    elif any(one.failure_threshold is not None for one in places):
+        sentences.append("No run failed.")
+    if n_missing := sum(sum(one.missing.values()) for one in places):
+        sentences.append(f"{n_missing:,} run{'s are' if n_missing > 1 else ' is'} missing.")
+    if costs := sorted((cost, who) for who, cost in processor_seconds(analysis.results).items()):
+        names = [who[0] if len(places) == 1 else " on ".join(who) for _, who in costs]
+        told = [f"{duration(cost)} ({name})" for (cost, _), name in zip(costs, names, strict=True)]
+        ends = " to ".join(told[:: max(len(told) - 1, 1)])
+        sentences.append(f"Processor time of the median run: {ends}.")
+    return sentences
+
+
+def _standing(analysis: StudyAnalysis) -> Iterator[str]:
+    """Who has the highest means, and the words on that agent's pairs."""
+    study, places = analysis.study, analysis.environments
+    known = [one for one in places if not math.isnan(one.agents[0].runs.mean)]
+    learnt = [one for one in known if not none_has_learnt(study, one)]
+    over = f"With {seeds(*(a.runs.n for one in known for a in one.agents))}" if known else ""
+    if not known:
+        yield f"No run has a figure for the {METRIC_WORDS[study.metric]}."
+    elif len(learnt) < len(known):
+        where = _names([one.environment for one in known if one not in learnt])
+        yield (
+            f"{over}, no agent has learnt on {where}: no median is above the best random or "
+            "constant policy."
+        )
+    if not learnt:
+        return
+    ranks, firsts = Counter[str](), Counter[str]()
+    for one in learnt:
+        ranks.update({agent.agent: place for place, agent in enumerate(one.agents)})
+        firsts.update(with_best_mean(one))
+    leader = min(ranks, key=lambda name: (-firsts[name], ranks[name]))
+    yield f"{over}, {_first_place(study, learnt, leader)}."
+    said: dict[str, dict[str, list[Pair]]] = {}
+    for pair in (p for one in learnt for p in pairs_both_ways(one.pairs).values()):
+        if pair.first == leader:
+            said.setdefault(pair.text, {}).setdefault(pair.second, []).append(pair)
+    undecided = said.pop("undecided", {})
+    for start, is_few in (("Certain", False), ("So far, with few runs", True)):
+        told = [
+            f"{text.removesuffix(' so far')} {'with' if text.startswith('tied') else 'than'} "
+            f"{_others(others, len(places))}"
+            for text, others in sorted(said.items())
+            if text.endswith(" so far") == is_few
+        ]
+        if told:
+            yield f"{start}: {leader} is {'; '.join(told)}."
+    if undecided:
+        yield f"Not settled: {_others(undecided, len(places))}."
+    if analysis.overall is not None and analysis.overall.best is not None:
+        yield f"Over all {len(places)} environments, best: {analysis.overall.best}."
+
+
+def _first_place(study: StudySpec, places: Sequence[EnvironmentAnalysis], leader: str) -> str:
+    """What the agent with the highest means has, and where."""
+    has_scores, metric = all(one.is_score for one in places), METRIC_WORDS[study.metric]
+    what = metric if metric.startswith("mean") else f"mean {metric}"
+    of_leader = [(one, a) for one in places for a in one.agents if a.agent == leader]
+    figures = [
+        score_number(agent.judged.point) if has_scores else number(agent.metric.mean.point)
+        for _, agent in of_leader
+    ]
+    if all(len(one.agents) == 1 for one in places):
+        on = [
+            f"{fig} on {one.environment}" for fig, (one, _) in zip(figures, of_leader, strict=True)
+        ]
+        return f"{leader} {'scores' if has_scores else f'has a {what} of'} {_names(on)}"
+    firsts = [names for one in places if leader in (names := with_best_mean(one))]
+    names = firsts[0] if len(places) == 1 else [leader]
+    verb = ("scores", "score") if has_scores else ("has", "have")
+    best = (
+        "highest"
+        if has_scores
+        else f"the {'lowest' if study.metric in COSTS else 'highest'} {what}"
+    )
+    told = f"{_names(names)} {verb[len(names) > 1]} {best}"
+    if len(places) == 1:
+        return f"{told}: {figures[0]}{' each' if len(names) > 1 else ''}"
+    shared = sum(len(names) > 1 for names in firsts)
+    level = f", in {shared} of them level with others" if shared else ""
+    return f"{told} in {len(firsts)} of {len(places)} environments{level}"
+
+
+def _others(pairs: Mapping[str, Sequence[Pair]], n_places: int) -> str:
+    """The other agents, in how many environments, and how many more seeds would settle it."""
+    told = []
+    for name, found in pairs.items():
+        more = [pair.seeds_needed - pair.n for pair in found if pair.seeds_needed is not None]
+        where = f" in {len(found)}" if n_places > 1 else ""
+        would = f" ({max(1, *more):,} more seeds would)" if len(more) == len(found) else ""
+        told.append(f"{name}{where}{would}")
+    return _names(told)
+
+
+def with_best_mean(environment: EnvironmentAnalysis, *labels: Sequence[str]) -> list[str]:
+    """Which of the agents with these labels, or of all, have the best mean."""
+    known = set().union(*labels)
+    there = [agent for agent in environment.agents if not labels or agent.agent in known]
+    means = {agent.agent: agent.metric.mean.point for agent in there}
+    best = next(iter(means.values()), math.nan)
+    return [label for label, mean in means.items() if math.isclose(mean, best)]
+
+
+def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:
+    """Median CPU seconds of a run by agent and environment, if all their runs were measured."""
+    times = results.summary.astype({"cpu_seconds": float})
+    grouped = times.groupby(["agent", "environment"], sort=False)["cpu_seconds"]
+    medians = grouped.agg(lambda runs: runs.median(skipna=False)).dropna()
+    rows = medians.reset_index().itertuples(index=False)
+    return {(agent, environment): time for agent, environment, time in rows}
+
+
+def duration(time: float) -> str:
+    """Seconds with two significant digits."""
+    if time <= 0:
+        return "0 s"
+    digits = 1 - math.floor(math.log10(time))
+    return f"{round(time, digits):,.{max(digits, 0)}f} s"
 
 
 def unproven_sentences(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
