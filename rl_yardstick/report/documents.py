@@ -21,15 +21,7 @@ from rl_yardstick.experiments.study import METRIC_WORDS
 from rl_yardstick.pipeline.errors import visible
 from rl_yardstick.pipeline.files import replacing, write_json, write_text
 from rl_yardstick.report import words
-from rl_yardstick.report.words import (
-    duration,
-    enumeration,
-    interval,
-    number,
-    processor_seconds,
-    score_number,
-    seed_sentence,
-)
+from rl_yardstick.report.words import enumeration, interval, number, score_number, seed_sentence
 
 # A markup is named by the suffix of its files and of its templates.
 Markup = Literal["md", "tex"]
@@ -206,7 +198,7 @@ def _legend(analysis: StudyAnalysis) -> str:
         f"{what} ±: the standard deviation of runs. Bold: the best agents, where another is shown "
         "to be worse on average."
     )
-    if processor_seconds(analysis.results):
+    if words.processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
     return " ".join([text, *words.on_changes(environments)])
 
@@ -217,7 +209,7 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
     is_for_all = len(best) == len(environment.agents)  # nobody is shown to be worse
     if is_for_all or words.none_has_learnt(analysis.study, environment):
         best = ()
-    costs, cells = processor_seconds(analysis.results), {}
+    costs, cells = words.processor_seconds(analysis.results), {}
     for agent in environment.agents:
         figure = number(agent.metric.mean.point)
         if environment.is_score:
@@ -225,7 +217,7 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
         cost = costs.get((agent.agent, environment.environment))
         spread, runs = number(float(f"{agent.spread:.2g}")), agent.runs
         notes = "" if spread == "0" else f" ± {spread}"
-        notes += "" if cost is None else f" ({duration(cost)})"
+        notes += "" if cost is None else f" ({words.duration(cost)})"
         notes += f", {runs.failed} of {runs.n} failed" if runs.failed else ""
         notes += f", {agent.n_missing} missing" if agent.n_missing else ""
         cells[agent.agent] = Cell(figure, agent.agent in best, notes)
@@ -237,7 +229,7 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
 
     A column in which no agent has a figure is left out.
     """
-    costs, found = processor_seconds(results), {}
+    costs, found = words.processor_seconds(results), {}
     for agent in environment.agents:
         runs, stays = agent.runs, agent.steps_to_stay
         cost = costs.get((agent.agent, environment.environment))
@@ -247,7 +239,7 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
             "score": NOTHING if agent.score is None else interval(agent.score, score_number),
             "failed": NOTHING if runs.failed is None else f"{runs.failed} of {runs.n}",
             "stays from": NOTHING if stays is None else number(stays.median.point),
-            "processor time": NOTHING if cost is None else duration(cost),
+            "processor time": NOTHING if cost is None else words.duration(cost),
         }
     table = pd.DataFrame.from_dict(found, orient="index")
     kept = table.loc[:, (table != NOTHING).any()]

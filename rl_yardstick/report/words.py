@@ -267,113 +267,88 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
 
 def answer(analysis: StudyAnalysis) -> list[str]:
     """Who is best, how certain that is, what failed, and what it cost: short sentences."""
-    sentences, places = [*_standing(analysis)], analysis.environments
+    places, sentences = analysis.environments, [*_standing(analysis)]
     failed, n = Counter[str](), Counter[str]()
-    for agent in (agent for one in places for agent in one.agents):
-        failed[agent.agent] += agent.runs.failed or 0
-        n[agent.agent] += agent.runs.n
-    if told := [f"{k} of {n[name]:,} runs of {name}" for name, k in failed.most_common() if k]:
-        sentences.append(f"Failed: {_names(told)}.")
-    elif any(one.failure_threshold is not None for one in places):
-        sentences.append("No run failed.")
+    for one in places:
+        failed.update({agent.agent: agent.runs.failed or 0 for agent in one.agents})
+        n.update({agent.agent: agent.runs.n for agent in one.agents})
+    told = [f"{name} {k} of {n[name]:,}" for name, k in failed.most_common() if k]
+    if any(one.failure_threshold is not None for one in places):
+        sentences.append(f"Failed runs: {_names(told) or 'none'}.")
     if n_missing := sum(sum(one.missing.values()) for one in places):
-        sentences.append(f"{n_missing:,} run{'s are' if n_missing > 1 else ' is'} missing.")
-    if costs := sorted((cost, who) for who, cost in processor_seconds(analysis.results).items()):
-        names = [who[0] if len(places) == 1 else " on ".join(who) for _, who in costs]
-        told = [f"{duration(cost)} ({name})" for (cost, _), name in zip(costs, names, strict=True)]
-        ends = " to ".join(told[:: max(len(told) - 1, 1)])
-        sentences.append(f"Processor time of the median run: {ends}.")
+        sentences.append(f"Missing runs: {n_missing:,}.")
+    costs = sorted((cost, who) for who, cost in processor_seconds(analysis.results).items())
+    if costs:
+        ends = [
+            f"{duration(cost)} ({agent}{f' on {place}' if len(places) > 1 else ''})"
+            for cost, (agent, place) in costs[:: max(len(costs) - 1, 1)]
+        ]
+        sentences.append(f"Processor time of the median run: {' to '.join(ends)}.")
     return sentences
 
 
 def _standing(analysis: StudyAnalysis) -> Iterator[str]:
-    """Who has the highest means, and the words on that agent's pairs."""
-    study, places = analysis.study, analysis.environments
+    """Who has the highest means, and the words on the pairs of that agent."""
+    study, places, overall = analysis.study, analysis.environments, analysis.overall
     known = [one for one in places if not math.isnan(one.agents[0].runs.mean)]
-    learnt = [one for one in known if not none_has_learnt(study, one)]
-    over = f"With {seeds(*(a.runs.n for one in known for a in one.agents))}" if known else ""
-    if not known:
-        yield f"No run has a figure for the {METRIC_WORDS[study.metric]}."
-    elif len(learnt) < len(known):
-        where = _names([one.environment for one in known if one not in learnt])
-        yield (
-            f"{over}, no agent has learnt on {where}: no median is above the best random or "
-            "constant policy."
-        )
-    if not learnt:
+    unlearnt = [one.environment for one in known if none_has_learnt(study, one)]
+    learnt = [one for one in known if one.environment not in unlearnt]
+    names = list(dict.fromkeys(agent.agent for one in places for agent in one.agents))
+    if places and (not known or (len(places) == 1 and (unlearnt or len(names) == 1))):
+        yield _lead(study, places[0])
+    elif unlearnt:
+        yield f"No agent has learnt on {_names(unlearnt)}."
+    if len(names) == 1 and overall is not None:
+        mean = score_number(overall.scores[names[0]].mean.point)
+        yield f"{names[0]} has a mean score of {mean} over all environments."
+    if not learnt or len(names) == 1:
         return
-    ranks, firsts = Counter[str](), Counter[str]()
-    for one in learnt:
-        ranks.update({agent.agent: place for place, agent in enumerate(one.agents)})
-        firsts.update(with_best_mean(one))
-    leader = min(ranks, key=lambda name: (-firsts[name], ranks[name]))
-    yield f"{over}, {_first_place(study, learnt, leader)}."
-    said: dict[str, dict[str, list[Pair]]] = {}
+    firsts = Counter(name for one in learnt for name in with_best_mean(one))
+    order = names if overall is None else list(overall.scores)
+    best = [name for name in order if firsts[name] == max(firsts.values())]
+    over = seeds(*(agent.runs.n for one in learnt for agent in one.agents))
+    what, first = METRIC_WORDS[study.metric].removeprefix("mean "), learnt[0].agents[0]
+    where = f": {number(first.metric.mean.point)}"
+    if all(one.is_score for one in learnt):
+        what, where = "score", f": {score_number(first.judged.point)}"
+    if len(places) > 1:
+        where = f" in {firsts[best[0]]} of {len(places)} environments"
+        where += " each" if len(best) > 1 else ""
+    has = "has" if len(best) == 1 else "have"
+    end = "lowest" if study.metric in COSTS else "highest"
+    yield f"With {over}, {_names(best)} {has} the {end} mean {what}{where}."
+    said: dict[str, list[Pair]] = {}
     for pair in (p for one in learnt for p in pairs_both_ways(one.pairs).values()):
-        if pair.first == leader:
-            said.setdefault(pair.text, {}).setdefault(pair.second, []).append(pair)
-    undecided = said.pop("undecided", {})
-    for start, is_few in (("Certain", False), ("So far, with few runs", True)):
-        told = [
-            f"{text.removesuffix(' so far')} {'with' if text.startswith('tied') else 'than'} "
-            f"{_others(others, len(places))}"
-            for text, others in sorted(said.items())
-            if text.endswith(" so far") == is_few
-        ]
-        if told:
-            yield f"{start}: {leader} is {'; '.join(told)}."
-    if undecided:
-        yield f"Not settled: {_others(undecided, len(places))}."
-    if analysis.overall is not None and analysis.overall.best is not None:
-        yield f"Over all {len(places)} environments, best: {analysis.overall.best}."
+        if pair.first == best[0]:
+            said.setdefault(pair.text, []).append(pair)
+    for text, pairs in sorted(said.items()):
+        more = [pair.seeds_needed - pair.n for pair in pairs if pair.seeds_needed is not None]
+        if text == "undecided":
+            would = f" ({seeds(max([1, *more])).replace(' ', ' more ')} would)"
+            would = would if len(more) == len(pairs) else ""
+            yield f"Not settled: {_others(pairs, len(places))}{would}."
+        else:
+            word, _, few = text.partition(" ")
+            relation = f"{word} {'with' if word == 'tied' else 'than'}"
+            start = f"{best[0]} is {relation} {_others(pairs, len(places))}"
+            yield f"{'So far, with few runs' if few else 'Certain'}: {start}."
+    if overall is not None and overall.best is not None:
+        yield f"By the mean over all environments, best: {overall.best}."
 
 
-def _first_place(study: StudySpec, places: Sequence[EnvironmentAnalysis], leader: str) -> str:
-    """What the agent with the highest means has, and where."""
-    has_scores, metric = all(one.is_score for one in places), METRIC_WORDS[study.metric]
-    what = metric if metric.startswith("mean") else f"mean {metric}"
-    of_leader = [(one, a) for one in places for a in one.agents if a.agent == leader]
-    figures = [
-        score_number(agent.judged.point) if has_scores else number(agent.metric.mean.point)
-        for _, agent in of_leader
-    ]
-    if all(len(one.agents) == 1 for one in places):
-        on = [
-            f"{fig} on {one.environment}" for fig, (one, _) in zip(figures, of_leader, strict=True)
-        ]
-        return f"{leader} {'scores' if has_scores else f'has a {what} of'} {_names(on)}"
-    firsts = [names for one in places if leader in (names := with_best_mean(one))]
-    names = firsts[0] if len(places) == 1 else [leader]
-    verb = ("scores", "score") if has_scores else ("has", "have")
-    best = (
-        "highest"
-        if has_scores
-        else f"the {'lowest' if study.metric in COSTS else 'highest'} {what}"
-    )
-    told = f"{_names(names)} {verb[len(names) > 1]} {best}"
-    if len(places) == 1:
-        return f"{told}: {figures[0]}{' each' if len(names) > 1 else ''}"
-    shared = sum(len(names) > 1 for names in firsts)
-    level = f", in {shared} of them level with others" if shared else ""
-    return f"{told} in {len(firsts)} of {len(places)} environments{level}"
-
-
-def _others(pairs: Mapping[str, Sequence[Pair]], n_places: int) -> str:
-    """The other agents, in how many environments, and how many more seeds would settle it."""
-    told = []
-    for name, found in pairs.items():
-        more = [pair.seeds_needed - pair.n for pair in found if pair.seeds_needed is not None]
-        where = f" in {len(found)}" if n_places > 1 else ""
-        would = f" ({max(1, *more):,} more seeds would)" if len(more) == len(found) else ""
-        told.append(f"{name}{where}{would}")
-    return _names(told)
+def _others(pairs: Sequence[Pair], n_places: int) -> str:
+    """The second agents, with the number of their environments if there are several."""
+    numbers: dict[int, list[str]] = {}
+    for name, n in Counter(pair.second for pair in pairs).most_common():
+        numbers.setdefault(n, []).append(name)
+    told = [f"{_names(names)}{f' in {n}' if n_places > 1 else ''}" for n, names in numbers.items()]
+    return "; ".join(told)
 
 
 def with_best_mean(environment: EnvironmentAnalysis, *labels: Sequence[str]) -> list[str]:
     """Which of the agents with these labels, or of all, have the best mean."""
-    known = set().union(*labels)
-    there = [agent for agent in environment.agents if not labels or agent.agent in known]
-    means = {agent.agent: agent.metric.mean.point for agent in there}
+    known = set().union(*labels or [[agent.agent for agent in environment.agents]])
+    means = {a.agent: a.metric.mean.point for a in environment.agents if a.agent in known}
     best = next(iter(means.values()), math.nan)
     return [label for label, mean in means.items() if math.isclose(mean, best)]
 

@@ -69,26 +69,23 @@ def verdict(report: Report) -> Section | None:
     return Section("verdict", "Verdict", context, data)
 
 
-def _dots(
-    report: Report, one: EnvironmentAnalysis, score_places: Sequence[float]
-) -> dict[str, Any]:
+def _dots(report: Report, one: EnvironmentAnalysis, places: Sequence[float]) -> dict[str, Any]:
     """The ticks of an axis from 0 to 1, and for each agent its runs on it, its median and cost."""
     agents = [agent for agent in one.agents if not math.isnan(agent.runs.mean)]
     values = [one.scores[agent.agent] * (-1 if one.is_cost else 1) for agent in agents]
-    knots, places = np.array(SCORES), np.array(score_places)
+    knots = np.array(SCORES)
     if not one.is_score and agents:
-        knots = np.unique([np.nanmin(values), np.nanmax(values)])
-        places = np.linspace(0, 1, len(knots))
+        every = np.concatenate(values)
+        knots, places = np.unique([np.nanmin(every), np.nanmax(every)]), (0, 1)
     costs, rows = words.processor_seconds(report.analysis.results), []
     for agent, runs in zip(agents, values, strict=True):
         ranked = np.argsort(runs)[: np.isfinite(runs).sum()]
         shown = ranked[np.linspace(0, len(ranked) - 1, min(len(ranked), MOST_DOTS)).astype(int)]
-        seeds = shown + report.analysis.study.first_seed
-        dots = zip(np.interp(runs[shown], knots, places), seeds, runs[shown], strict=True)
-        median = np.interp(np.nanmedian(runs), knots, places)
+        *at, median = np.interp([*runs[shown], np.nanmedian(runs)], knots, places[: len(knots)])
+        dots = zip(at, shown + report.analysis.study.first_seed, runs[shown], strict=True)
         cost = costs.get((agent.agent, one.environment))
         rows.append((agent, [*dots], median, "" if cost is None else words.duration(cost)))
-    return {"rows": rows, "ticks": [*zip(places, map(number, knots), strict=True)]}
+    return {"rows": rows, "ticks": [*zip(places, map(number, knots), strict=False)]}
 
 
 def _sweeps(one: EnvironmentSeries) -> dict[str, dict[str, Any]]:
