@@ -35,7 +35,8 @@ DWARFED = 100
 # it, and has another one for the dark theme.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
-# Ticks of an axis of scores, and their places from 0 to 1 where most scores are above the second.
+# Ticks of an axis of scores; where most scores are above 0.8, ticks and their places from 0 to 1.
+LINEAR = (0.0, 0.5, 1.0)
 SCORES, STRETCHED = (0.0, 0.8, 0.9, 1.0), (0.0, 0.35, 0.675, 1.0)
 
 Dash = Literal["solid", "dash", "dashdot", "dot"]

@@ -268,6 +268,9 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
 def answer(analysis: StudyAnalysis) -> list[str]:
     """Who is best, how certain that is, what failed, and what it cost: short sentences."""
     places, sentences = analysis.environments, [*_standing(analysis)]
+    unlearnt = [one.environment for one in places if none_has_learnt(analysis.study, one)]
+    if unlearnt and len(places) > 1:
+        sentences.append(f"No agent has learnt on {_names(unlearnt)}.")
     failed, n = Counter[str](), Counter[str]()
     for one in places:
         failed.update({agent.agent: agent.runs.failed or 0 for agent in one.agents})
@@ -291,13 +294,10 @@ def _standing(analysis: StudyAnalysis) -> Iterator[str]:
     """Who has the highest means, and the words on the pairs of that agent."""
     study, places, overall = analysis.study, analysis.environments, analysis.overall
     known = [one for one in places if not math.isnan(one.agents[0].runs.mean)]
-    unlearnt = [one.environment for one in known if none_has_learnt(study, one)]
-    learnt = [one for one in known if one.environment not in unlearnt]
+    learnt = [one for one in known if not none_has_learnt(study, one)]
     names = list(dict.fromkeys(agent.agent for one in places for agent in one.agents))
-    if places and (not known or (len(places) == 1 and (unlearnt or len(names) == 1))):
+    if places and (not known or (len(places) == 1 and (not learnt or len(names) == 1))):
         yield _lead(study, places[0])
-    elif unlearnt:
-        yield f"No agent has learnt on {_names(unlearnt)}."
     if len(names) == 1 and overall is not None:
         mean = score_number(overall.scores[names[0]].mean.point)
         yield f"{names[0]} has a mean score of {mean} over all environments."
@@ -389,7 +389,8 @@ def places_without_a_run(analysis: StudyAnalysis) -> list[str]:
 def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     agents, words = environment.agents, METRIC_WORDS[study.metric]
     if math.isnan(agents[0].runs.mean):
-        return f"No run has a figure for the {words}."
+        hint = "" if math.isnan(agents[0].regret.point) else "; bandits have --metric regret"
+        return f"No run has a figure for the {words}{hint}."
     optimum = ""
     if study.metric in ON_THE_SCALE and environment.optimum is not None:
         optimum = f"; the optimum is {optimum_words(environment)}"

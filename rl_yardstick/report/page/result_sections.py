@@ -21,7 +21,7 @@ from rl_yardstick.report import words
 from rl_yardstick.report.documents import MARKUPS, headline, verdicts_as
 from rl_yardstick.report.page.frame import Report, Section, setting
 from rl_yardstick.report.ranking import COLUMNS, OTHER_RETURNS, Column, Row, filled
-from rl_yardstick.report.series import SCORES, STRETCHED, Curve, EnvironmentSeries
+from rl_yardstick.report.series import LINEAR, SCORES, STRETCHED, Curve, EnvironmentSeries
 from rl_yardstick.report.words import number, seed_sentence, with_best_mean
 
 MOST_DOTS = 300  # of an agent on an environment; of more runs as many, evenly spaced by rank
@@ -38,7 +38,7 @@ def verdict(report: Report) -> Section | None:
             "environment": one.environment,
             "conclusion": words.conclusion(study, one.environment),
             "pairs": words.pairs_both_ways(one.environment.pairs),
-            "dots": _dots(report, one.environment, STRETCHED if is_stretched else SCORES),
+            "dots": _dots(report, one.environment, is_stretched),
             "has_sweeps": bool(one.sweeps),
             "grids": {
                 name: {
@@ -69,14 +69,14 @@ def verdict(report: Report) -> Section | None:
     return Section("verdict", "Verdict", context, data)
 
 
-def _dots(report: Report, one: EnvironmentAnalysis, places: Sequence[float]) -> dict[str, Any]:
+def _dots(report: Report, one: EnvironmentAnalysis, is_stretched: bool) -> dict[str, Any]:
     """The ticks of an axis from 0 to 1, and for each agent its runs on it, its median and cost."""
     agents = [agent for agent in one.agents if not math.isnan(agent.runs.mean)]
     values = [one.scores[agent.agent] * (-1 if one.is_cost else 1) for agent in agents]
-    knots = np.array(SCORES)
+    knots, places = (SCORES, STRETCHED) if is_stretched else (LINEAR, LINEAR)
     if not one.is_score and agents:
         every = np.concatenate(values)
-        knots, places = np.unique([np.nanmin(every), np.nanmax(every)]), (0, 1)
+        knots, places = sorted({np.nanmin(every), np.nanmax(every)}), (0, 1)
     costs, rows = words.processor_seconds(report.analysis.results), []
     for agent, runs in zip(agents, values, strict=True):
         ranked = np.argsort(runs)[: np.isfinite(runs).sum()]
