@@ -33,7 +33,7 @@ def verdict(report: Report) -> Section | None:
     study, metric = analysis.study, METRIC_WORDS[analysis.study.metric]
     scores = [runs for one in analysis.environments if one.is_score for runs in one.scores.values()]
     is_stretched = bool(scores) and float(np.nanmedian(np.concatenate(scores))) >= SCORES[1]
-    cards = [
+    cards: list[dict[str, Any]] = [
         {
             "environment": one.environment,
             "conclusion": words.conclusion(study, one.environment),
@@ -73,10 +73,11 @@ def _dots(report: Report, one: EnvironmentAnalysis, is_stretched: bool) -> dict[
     """The ticks of an axis from 0 to 1, and for each agent its runs on it, its median and cost."""
     agents = [agent for agent in one.agents if not math.isnan(agent.runs.mean)]
     values = [one.scores[agent.agent] * (-1 if one.is_cost else 1) for agent in agents]
-    knots, places = (SCORES, STRETCHED) if is_stretched else (LINEAR, LINEAR)
+    knots: Sequence[float] = SCORES if is_stretched else LINEAR
+    places: Sequence[float] = STRETCHED if is_stretched else LINEAR
     if not one.is_score and agents:
         every = np.concatenate(values)
-        knots, places = sorted({np.nanmin(every), np.nanmax(every)}), (0, 1)
+        knots, places = sorted({float(np.nanmin(every)), float(np.nanmax(every))}), (0, 1)
     costs, rows = words.processor_seconds(report.analysis.results), []
     for agent, runs in zip(agents, values, strict=True):
         ranked = np.argsort(runs)[: np.isfinite(runs).sum()]
