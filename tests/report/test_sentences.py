@@ -125,11 +125,8 @@ ANSWERS = {
     "none.": [place_of({}, pairs=FEW), place_of({}, pairs=OPEN[1:], label="sea")],
     "a has the highest mean return of the final policy: 100. Not settled: b (789 more seeds "
     "would).": [place_of({}, pairs=OPEN[:1], is_score=False, failure_threshold=None)],
-    "a and b have the highest mean score in 1 of 2 environments each. No agent has learnt on sea. "
-    "Failed runs: none. Missing runs: 2.": [
-        place_of({}, {"a": 90.0, "b": 90.0}, missing={"a": 2}),
-        place_of({}, {"a": 21.0, "b": 20.0}, label="sea"),
-    ],
+    "a and b have the highest mean score in 1 of 2 environments each. No agent has learnt on 2. "
+    "Failed runs: none.": [place_of({}, dict.fromkeys("ab", x), label=f"{x}") for x in (90.0, 2)],
     "": [],
 }
 
