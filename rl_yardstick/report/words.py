@@ -333,7 +333,7 @@ def _standing(analysis: StudyAnalysis) -> Iterator[str]:
             start = f"{best[0]} is {relation} {_others(pairs, len(places))}"
             yield f"{'So far, with few runs' if few else 'Certain'}: {start}."
     if overall is not None and overall.best is not None:
-        yield f"By the mean over all environments, best: {overall.best}."
+        yield f"By the mean score over all environments, best: {overall.best}."
 
 
 def _others(pairs: Sequence[Pair], n_places: int) -> str:
