@@ -306,15 +306,14 @@ def _standing(analysis: StudyAnalysis) -> Iterator[str]:
     firsts = Counter(name for one in learnt for name in with_best_mean(one))
     order = names if overall is None else list(overall.scores)
     best = [name for name in order if firsts[name] == max(firsts.values())]
+    has, each = ("has", "") if len(best) == 1 else ("have", " each")
     over = seeds(*(agent.runs.n for one in learnt for agent in one.agents))
     what, first = METRIC_WORDS[study.metric].removeprefix("mean "), learnt[0].agents[0]
     where = f": {number(first.metric.mean.point)}"
     if all(one.is_score for one in learnt):
         what, where = "score", f": {score_number(first.judged.point)}"
     if len(places) > 1:
-        where = f" in {firsts[best[0]]} of {len(places)} environments"
-        where += " each" if len(best) > 1 else ""
-    has = "has" if len(best) == 1 else "have"
+        where = f" in {firsts[best[0]]} of {len(places)} environments{each}"
     end = "lowest" if study.metric in COSTS else "highest"
     yield f"With {over}, {_names(best)} {has} the {end} mean {what}{where}."
     said: dict[str, list[Pair]] = {}
