@@ -1,10 +1,11 @@
-r"""Fills the headline study's tables into README.md and docs/library-vs-hand-rolled.md.
+r"""Fills the headline study's table into docs, and writes its runs as docs/measured/held-out.csv.
 
     python compare.py studies/library-vs-hand-rolled.yml --first-seed 1000 --name held-out
     python benchmarks/headline.py logs/studies/held-out
+    python docs/scripts/draw_images.py dots
 
-Nothing is run: the program reads the finished study, and judges it again. It replaces the text
-between pairs of comments such as ``<!-- headline: held-out -->`` and ``<!-- end -->``.
+Nothing is run. The text of the page between the comments ``<!-- headline: held-out -->`` and
+``<!-- end -->`` is replaced.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+
+import pandas as pd
 
 from rl_yardstick.experiments.analysis import StudyAnalysis, analyse
 from rl_yardstick.experiments.plan import plan
@@ -24,8 +26,9 @@ from rl_yardstick.report.documents import headline, table_as
 
 ROOT = Path(__file__).resolve().parent.parent
 STUDY = ROOT / "studies" / "library-vs-hand-rolled.yml"
-PAGES = (ROOT / "README.md", ROOT / "docs" / "library-vs-hand-rolled.md")
-BLOCK = re.compile(r"(<!-- headline: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+PAGE = ROOT / "docs" / "library-vs-hand-rolled.md"
+RUNS = ROOT / "docs" / "measured" / "held-out.csv"
+BLOCK = re.compile(r"(?<=<!-- headline: held-out -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
 
 def judged(root: Path) -> StudyAnalysis:
@@ -45,27 +48,30 @@ def judged(root: Path) -> StudyAnalysis:
     return analysis
 
 
-def filled(page: str, blocks: Mapping[str, str]) -> str:
-    """The page with the given blocks replaced."""
-
-    def put(found: re.Match[str]) -> str:
-        text = blocks.get(found[2])
-        return found[0] if text is None else f"{found[1]}{text.rstrip()}\n{found[3]}"
-
-    return BLOCK.sub(put, page)
+def runs_of(analysis: StudyAnalysis) -> pd.DataFrame:
+    """A row for each run: its score in [0, 1], its seconds, 1 if it failed or was trained apart."""
+    table = analysis.results.summary[["environment", "agent", "seed", "score", "cpu_seconds"]]
+    scores = table["score"].astype(float).clip(0, 1)
+    places = analysis.environments
+    threshold = table["environment"].map({one.environment: one.failure_threshold for one in places})
+    changed = {(one.environment, a.agent) for one in places for a in one.agents if a.changes}
+    pairs = zip(table["environment"], table["agent"], strict=True)
+    failed = (scores < threshold.astype(float)).astype(int)
+    is_changed = [int(pair in changed) for pair in pairs]
+    return table.assign(score=scores.round(5), failed=failed, changed=is_changed)
 
 
 def main() -> None:
-    """Read the study, and fill the pages."""
+    """Read the study, fill the page, and write the runs."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("study", type=Path, metavar="FOLDER", help="the study's folder")
     analysis = judged(parser.parse_args().study)
-    blocks = {"held-out": table_as("md", headline(analysis))}
-    for path in PAGES:
-        path.write_text(filled(path.read_text(encoding="utf-8"), blocks), encoding="utf-8")
-        print(f"filled {path}")
+    table = table_as("md", headline(analysis)).rstrip() + "\n"
+    PAGE.write_text(BLOCK.sub(lambda _: table, PAGE.read_text("utf-8")), "utf-8")
+    runs_of(analysis).to_csv(RUNS, index=False, lineterminator="\n")
+    print(f"filled {PAGE}, wrote {RUNS}")
 
 
 if __name__ == "__main__":

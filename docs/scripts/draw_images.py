@@ -2,7 +2,7 @@
 
 All pictures are made by the version that is checked out: it renders environments, trains agents and
 draws their runs with the code that users run. The picture of a study's page needs Chromium, and the
-figures of the headline study need that study; without these, old pictures are kept. With names of
+curves of the headline study need that study; without these, old pictures are kept. With names of
 pictures as arguments, only these are drawn.
 """
 
@@ -122,6 +122,49 @@ def draw_report() -> None:
         keep(shot, "report.png")
 
 
+# The colours of GitHub's pages, by the name of the picture.
+DOTS = {
+    "dots.svg": {"page": "#ffffff", "ink": "#1f2328", "muted": "#59636e", "line": "#d1d9e0"}
+    | {"soft": "#eff2f5", "blue": "#0969da", "red": "#d1242f"},
+    "dots-dark.svg": {"page": "#0d1117", "ink": "#f0f6fc", "muted": "#9198a1", "line": "#3d444d"}
+    | {"soft": "#1c222b", "blue": "#58a6ff", "red": "#ff7b72"},
+}
+
+
+def draw_dots() -> None:
+    """Each run of the headline study as a dot, from docs/measured/held-out.csv alone."""
+    import numpy as np
+    import pandas as pd
+    from jinja2 import Environment, FileSystemLoader
+
+    from rl_yardstick.experiments.analysis import MARK
+    from rl_yardstick.report.series import SCORES, STRETCHED
+    from rl_yardstick.report.words import duration
+
+    runs = pd.read_csv(DOCS / "measured" / "held-out.csv")
+    runs["place"] = np.interp(runs["score"], SCORES, STRETCHED)
+    changed = set(runs["agent"][runs["changed"] == 1])
+    panels = []
+    for name, here in runs.groupby("environment", sort=False):
+        rows = []
+        for agent, found in here.groupby("agent", sort=False):
+            failed = found["failed"] == 1
+            row = {"name": f"{agent} {MARK}" if agent in changed else agent, "n": len(found)}
+            places = {"dots": found["place"][~failed], "failed": found["place"][failed]}
+            row["dots"] = {kind: list(where) for kind, where in places.items()}
+            row["median"] = np.interp(found["score"].median(), SCORES, STRETCHED)
+            row["cost"] = duration(float(found["cpu_seconds"].median()))
+            rows.append(row)
+        panels.append({"name": name, "rows": rows})
+    loader = FileSystemLoader(Path(__file__).parent)
+    template = Environment(loader=loader, trim_blocks=True, autoescape=True).get_template(
+        "dots.svg.jinja"
+    )
+    shown = {"panels": panels, "n_runs": len(runs), "scores": SCORES, "places": STRETCHED}
+    for picture, colours in DOTS.items():
+        (IMAGES / picture).write_text(template.render(**shown, **colours), encoding="utf-8")
+
+
 def copy_headline() -> None:
     """Figures of the headline study, if it is in logs/studies/held-out; it takes an hour."""
     folder = ROOT / "logs" / "studies" / "held-out" / "figures"
@@ -191,6 +234,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "environments": draw_environments,
     "warehouse": draw_warehouse,
     "report": draw_report,
+    "dots": draw_dots,
     "headline": copy_headline,
     "tutorials": draw_tutorials,
 }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import math
 import re
 import unicodedata
 from collections.abc import Callable, Mapping
@@ -199,7 +198,7 @@ def _legend(analysis: StudyAnalysis) -> str:
         f"{what} ±: the standard deviation of runs. Bold: the best agents, where another is shown "
         "to be worse on average."
     )
-    if processor_seconds(analysis.results):
+    if words.processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
     return " ".join([text, *words.on_changes(environments)])
 
@@ -210,7 +209,7 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
     is_for_all = len(best) == len(environment.agents)  # nobody is shown to be worse
     if is_for_all or words.none_has_learnt(analysis.study, environment):
         best = ()
-    costs, cells = processor_seconds(analysis.results), {}
+    costs, cells = words.processor_seconds(analysis.results), {}
     for agent in environment.agents:
         figure = number(agent.metric.mean.point)
         if environment.is_score:
@@ -218,7 +217,7 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
         cost = costs.get((agent.agent, environment.environment))
         spread, runs = number(float(f"{agent.spread:.2g}")), agent.runs
         notes = "" if spread == "0" else f" ± {spread}"
-        notes += "" if cost is None else f" ({duration(cost)})"
+        notes += "" if cost is None else f" ({words.duration(cost)})"
         notes += f", {runs.failed} of {runs.n} failed" if runs.failed else ""
         notes += f", {agent.n_missing} missing" if agent.n_missing else ""
         cells[agent.agent] = Cell(figure, agent.agent in best, notes)
@@ -230,7 +229,7 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
 
     A column in which no agent has a figure is left out.
     """
-    costs, found = processor_seconds(results), {}
+    costs, found = words.processor_seconds(results), {}
     for agent in environment.agents:
         runs, stays = agent.runs, agent.steps_to_stay
         cost = costs.get((agent.agent, environment.environment))
@@ -240,7 +239,7 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
             "score": NOTHING if agent.score is None else interval(agent.score, score_number),
             "failed": NOTHING if runs.failed is None else f"{runs.failed} of {runs.n}",
             "stays from": NOTHING if stays is None else number(stays.median.point),
-            "processor time": NOTHING if cost is None else duration(cost),
+            "processor time": NOTHING if cost is None else words.duration(cost),
         }
     table = pd.DataFrame.from_dict(found, orient="index")
     kept = table.loc[:, (table != NOTHING).any()]
@@ -248,23 +247,6 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
     metric = METRIC_WORDS[results.study.metric]
     caption = f"{environment.environment}: {metric}, with 95 % intervals over seeds."
     return Table(["", *kept], rows, caption)
-
-
-def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:
-    """Median CPU seconds of a run by agent and environment, if all their runs were measured."""
-    times = results.summary.astype({"cpu_seconds": float})
-    grouped = times.groupby(["agent", "environment"], sort=False)["cpu_seconds"]
-    medians = grouped.agg(lambda runs: runs.median(skipna=False)).dropna()
-    rows = medians.reset_index().itertuples(index=False)
-    return {(agent, environment): time for agent, environment, time in rows}
-
-
-def duration(time: float) -> str:
-    """Seconds with two significant digits."""
-    if time <= 0:
-        return "0 s"
-    digits = 1 - math.floor(math.log10(time))
-    return f"{round(time, digits):,.{max(digits, 0)}f} s"
 
 
 PAIR_COLUMNS = (

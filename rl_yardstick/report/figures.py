@@ -48,9 +48,8 @@ from rl_yardstick.report.series import (
     linear_up_to,
     mean_regret,
     regret_of_runs,
-    with_best_mean,
 )
-from rl_yardstick.report.words import enumeration, number
+from rl_yardstick.report.words import enumeration, number, with_best_mean
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

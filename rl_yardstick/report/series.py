@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -35,6 +34,10 @@ DWARFED = 100
 # Okabe and Ito's palette, which is safe for colour-blind readers. The page's style sheet repeats
 # it, and has another one for the dark theme.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+# Ticks of an axis of scores; where most scores are above 0.8, ticks and their places from 0 to 1.
+LINEAR = (0.0, 0.5, 1.0)
+SCORES, STRETCHED = (0.0, 0.8, 0.9, 1.0), (0.0, 0.35, 0.675, 1.0)
 
 Dash = Literal["solid", "dash", "dashdot", "dot"]
 # Seven colours and four line styles repeat together: neighbours differ in both, so lines differ in
@@ -440,14 +443,6 @@ def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict
             parameters = symbol(names[0]), symbol(names[1])
             found[group] = Grid(parameters, rows, columns, np.array(points), labels)
     return found
-
-
-def with_best_mean(environment: EnvironmentAnalysis, *labels: Sequence[str]) -> list[str]:
-    """Which of the agents with these labels have the best mean."""
-    known = set().union(*labels)
-    means = {a.agent: a.metric.mean.point for a in environment.agents if a.agent in known}
-    best = next(iter(means.values()), math.nan)
-    return [label for label, mean in means.items() if math.isclose(mean, best)]
 
 
 def _groups(

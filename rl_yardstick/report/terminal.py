@@ -18,11 +18,11 @@ from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.study import METRIC_WORDS, StudySpec
 from rl_yardstick.report.ranking import BANDIT_COLUMNS, CAPTIONS, COLUMNS, Column, Row, filled
 from rl_yardstick.report.words import (
+    answer,
     conclusion,
     enumeration,
     number,
     optimum_words,
-    overall_sentences,
     pairs_both_ways,
     seed_sentence,
     seeds,
@@ -44,12 +44,12 @@ FIRST_LEFT_OUT = (
 
 
 def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
-    """Print a table and a conclusion for each environment, then a sentence on the seeds.
+    """Print the answer, a table and a conclusion for each environment, and a sentence on the seeds.
 
     The pairs are a table of words for three agents or more, if it fits, and else sentences.
     """
-    for sentence in overall_sentences(analysis):
-        console.print()
+    console.print()
+    for sentence in answer(analysis):
         console.print(sentence, highlight=False)
     for environment in analysis.environments:
         console.print()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 
 from rl_yardstick.experiments.analysis import MARK, ON_THE_SCALE, EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.plan import Seeds, TuningSeeds
-from rl_yardstick.experiments.study import METRIC_WORDS, OF_TRAINING, StudySpec
+from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import bracket_mark
@@ -23,7 +24,7 @@ from rl_yardstick.verdicts import Estimate, Pair, unseen_share
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.explanation import Explanation, StateLoss
     from rl_yardstick.experiments.plan import PlannedRun
-    from rl_yardstick.experiments.results import Tried
+    from rl_yardstick.experiments.results import StudyResults, Tried
 
 
 SIGNIFICANT = 4  # digits
@@ -264,17 +265,108 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
     return Conclusion(_lead(study, environment), pairs, tuple(notes))
 
 
-def overall_sentences(analysis: StudyAnalysis) -> list[str]:
-    """Who is best over all environments; nothing for a single one."""
-    overall = analysis.overall
-    if overall is None or overall.best is None or len(overall.scores) < 2:
-        return []
-    n = len(analysis.environments)
-    where = "Over both environments" if n == 2 else f"Over all {n} environments"
-    means = [(name, overall.scores[name].mean.point) for name in overall.best.agents]
-    told = [f"{name} {score_number(mean)}" for name, mean in means]
-    scores = f"mean score: {', '.join(told)}"
-    return [f"{where}, best: {overall.best}; {scores}.", *unproven_sentences(analysis.environments)]
+def answer(analysis: StudyAnalysis) -> list[str]:
+    """Who is best, how certain that is, what failed, and what it cost: short sentences."""
+    places, sentences = analysis.environments, [*_standing(analysis)]
+    unlearnt = [one.environment for one in places if none_has_learnt(analysis.study, one)]
+    if unlearnt and len(places) > 1:
+        sentences.append(f"No agent has learnt on {_names(unlearnt)}.")
+    failed, n = Counter[str](), Counter[str]()
+    for one in places:
+        failed.update({agent.agent: agent.runs.failed or 0 for agent in one.agents})
+        n.update({agent.agent: agent.runs.n for agent in one.agents})
+    told = [f"{name} {k} of {n[name]:,}" for name, k in failed.most_common() if k]
+    if any(one.failure_threshold is not None for one in places):
+        sentences.append(f"Failed runs: {_names(told) or 'none'}.")
+    if n_missing := sum(sum(one.missing.values()) for one in places):
+        sentences.append(f"Missing runs: {n_missing:,}.")
+    costs = sorted((cost, who) for who, cost in processor_seconds(analysis.results).items())
+    if costs:
+        ends = [
+            f"{duration(cost)} ({agent}{f' on {place}' if len(places) > 1 else ''})"
+            for cost, (agent, place) in costs[:: max(len(costs) - 1, 1)]
+        ]
+        sentences.append(f"Processor time of the median run: {' to '.join(ends)}.")
+    return sentences
+
+
+def _standing(analysis: StudyAnalysis) -> Iterator[str]:
+    """Who has the highest means, and the words on the pairs of that agent."""
+    study, places, overall = analysis.study, analysis.environments, analysis.overall
+    known = [one for one in places if not math.isnan(one.agents[0].runs.mean)]
+    learnt = [one for one in known if not none_has_learnt(study, one)]
+    names = list(dict.fromkeys(agent.agent for one in places for agent in one.agents))
+    if places and (not known or (len(places) == 1 and (not learnt or len(names) == 1))):
+        yield _lead(study, places[0])
+    if len(names) == 1 and overall is not None:
+        mean = score_number(overall.scores[names[0]].mean.point)
+        yield f"{names[0]} has a mean score of {mean} over all environments."
+    if not learnt or len(names) == 1:
+        return
+    firsts = Counter(name for one in learnt for name in with_best_mean(one))
+    order = names if overall is None else list(overall.scores)
+    best = [name for name in order if firsts[name] == max(firsts.values())]
+    has, each = ("has", "") if len(best) == 1 else ("have", " each")
+    over = seeds(*(agent.runs.n for one in learnt for agent in one.agents))
+    what, first = METRIC_WORDS[study.metric].removeprefix("mean "), learnt[0].agents[0]
+    where = f": {number(first.metric.mean.point)}"
+    if all(one.is_score for one in learnt):
+        what, where = "score", f": {score_number(first.judged.point)}"
+    if len(places) > 1:
+        where = f" in {firsts[best[0]]} of {len(places)} environments{each}"
+    end = "lowest" if study.metric in COSTS else "highest"
+    yield f"With {over}, {_names(best)} {has} the {end} mean {what}{where}."
+    said: dict[str, list[Pair]] = {}
+    for pair in (p for one in learnt for p in pairs_both_ways(one.pairs).values()):
+        if pair.first == best[0]:
+            said.setdefault(pair.text, []).append(pair)
+    for text, pairs in sorted(said.items()):
+        more = [pair.seeds_needed - pair.n for pair in pairs if pair.seeds_needed is not None]
+        if text == "undecided":
+            would = f" ({seeds(max([1, *more])).replace(' ', ' more ')} would)"
+            would = would if len(more) == len(pairs) else ""
+            yield f"Not settled: {_others(pairs, len(places))}{would}."
+        else:
+            word, _, few = text.partition(" ")
+            relation = f"{word} {'with' if word == 'tied' else 'than'}"
+            start = f"{best[0]} is {relation} {_others(pairs, len(places))}"
+            yield f"{'So far, with few runs' if few else 'Certain'}: {start}."
+    if overall is not None and overall.best is not None:
+        yield f"By the mean score over all environments, best: {overall.best}."
+
+
+def _others(pairs: Sequence[Pair], n_places: int) -> str:
+    """The second agents, with the number of their environments if there are several."""
+    numbers: dict[int, list[str]] = {}
+    for name, n in Counter(pair.second for pair in pairs).most_common():
+        numbers.setdefault(n, []).append(name)
+    told = [f"{_names(names)}{f' in {n}' if n_places > 1 else ''}" for n, names in numbers.items()]
+    return "; ".join(told)
+
+
+def with_best_mean(environment: EnvironmentAnalysis, *labels: Sequence[str]) -> list[str]:
+    """Which of the agents with these labels, or of all, have the best mean."""
+    known = set().union(*labels or [[agent.agent for agent in environment.agents]])
+    means = {a.agent: a.metric.mean.point for a in environment.agents if a.agent in known}
+    best = next(iter(means.values()), math.nan)
+    return [label for label, mean in means.items() if math.isclose(mean, best)]
+
+
+def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:
+    """Median CPU seconds of a run by agent and environment, if all their runs were measured."""
+    times = results.summary.astype({"cpu_seconds": float})
+    grouped = times.groupby(["agent", "environment"], sort=False)["cpu_seconds"]
+    medians = grouped.agg(lambda runs: runs.median(skipna=False)).dropna()
+    rows = medians.reset_index().itertuples(index=False)
+    return {(agent, environment): time for agent, environment, time in rows}
+
+
+def duration(time: float) -> str:
+    """Seconds with two significant digits."""
+    if time <= 0:
+        return "0 s"
+    digits = 1 - math.floor(math.log10(time))
+    return f"{round(time, digits):,.{max(digits, 0)}f} s"
 
 
 def unproven_sentences(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
@@ -296,7 +388,8 @@ def places_without_a_run(analysis: StudyAnalysis) -> list[str]:
 def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     agents, words = environment.agents, METRIC_WORDS[study.metric]
     if math.isnan(agents[0].runs.mean):
-        return f"No run has a figure for the {words}."
+        hint = "" if math.isnan(agents[0].regret.point) else "; bandits have --metric regret"
+        return f"No run has a figure for the {words}{hint}."
     optimum = ""
     if study.metric in ON_THE_SCALE and environment.optimum is not None:
         optimum = f"; the optimum is {optimum_words(environment)}"

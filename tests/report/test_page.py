@@ -22,7 +22,7 @@ from rl_yardstick.report.series import study_series
 from tests.report.made_up import HOSTILE
 
 SECTION_NAMES = [
-    *("verdict", "overview", "ranking", "curves", "comparison", "overall"),
+    *("verdict", "ranking", "curves", "comparison", "overall"),
     *("why", "policies", "films", "settings"),
 ]
 

@@ -130,7 +130,7 @@ def page(browser, report_study):
 
 
 def test_it_loads_without_an_error_and_without_the_network(page, report_study):
-    page.click(page.all("#overview [data-choose]")[1])
+    page.click(page.all("#verdict [data-choose]")[1])
     assert Select(page.find("#environment")).first_selected_option.text == "Warehouse-v0"
     assert set(page.shown("h2 .where")) == {"Warehouse-v0"}
     time.sleep(0.5)
@@ -139,11 +139,7 @@ def test_it_loads_without_an_error_and_without_the_network(page, report_study):
     assert page.driver.title == "Small & <b>bold</b>"
     assert page.all("main b") == []
     assert HOSTILE in page.find("#ranking").text
-    labels = page.run(
-        "return [...document.querySelectorAll('#intervals .ytick')].map(t => t.textContent).join()"
-    )
-    assert "document.title" in labels
-    assert "<script>" in labels
+    assert HOSTILE in page.find(".dots").text
 
 
 def test_all_that_reacts_can_be_reached_by_keyboard_and_says_its_state(page):

@@ -23,8 +23,8 @@ from rl_yardstick.report.series import (
     run_series,
     study_series,
     sweeps,
-    with_best_mean,
 )
+from rl_yardstick.report.words import with_best_mean
 from tests.report import made_up
 
 

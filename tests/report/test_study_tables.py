@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from rl_yardstick.commands.terminal import TextConsole
-from rl_yardstick.report import documents
+from rl_yardstick.report import documents, words
 from rl_yardstick.report.documents import MARKUPS, headline, ranking, table_as
 from rl_yardstick.report.page import result_sections
 from rl_yardstick.report.page.frame import Report
@@ -55,7 +55,7 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
         "| `first` | **0.9** (40 s) |",
     ]
     assert legend == LEGEND
-    assert documents.processor_seconds(of_lake(cpu=CPU).results) == {
+    assert words.processor_seconds(of_lake(cpu=CPU).results) == {
         ("first", "lake"): 40.4,
         ("same", "lake"): 0.1249,
     }

@@ -19,7 +19,6 @@ from rl_yardstick.report.page.frame import Report, Section
 # To add a section, list its function here.
 SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
     result_sections.verdict,
-    result_sections.overview,
     result_sections.ranking,
     result_sections.curves,
     world_sections.bandits,

@@ -20,15 +20,8 @@ from rl_yardstick.envs.layout import GridLayout
 from rl_yardstick.experiments.analysis import StudyAnalysis
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.pipeline.errors import visible
-from rl_yardstick.report.ranking import bar
 from rl_yardstick.report.series import StudySeries
-from rl_yardstick.report.words import (
-    interval_alone,
-    number,
-    optimum_words,
-    scale_words,
-    score_number,
-)
+from rl_yardstick.report.words import number, optimum_words, scale_words
 
 _WORD_ENDS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/:.])(?=\w)")
 
@@ -54,9 +47,6 @@ def templates(folder: str = "") -> Environment:
         number=number,
         optimum=optimum_words,
         hidden=scale_words,
-        interval=interval_alone,
-        score=score_number,
-        bar=bar,
         # A label may wrap where its words end: "Frozen|Lake8x8-|v1".
         breakable=lambda label: Markup("<wbr>").join(_WORD_ENDS.split(label)),
     )

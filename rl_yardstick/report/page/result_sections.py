@@ -1,99 +1,45 @@
-"""Sections on results: overview, verdicts, rankings, curves, differences, scores, settings."""
+"""Sections on results: verdicts, rankings, curves, differences, scores, settings."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from rl_yardstick.experiments.analysis import EnvironmentAnalysis
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.pool import ERROR_FILE
 from rl_yardstick.experiments.results import StudyResults, mixed_versions
 from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, StudySpec
-from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.report import words
-from rl_yardstick.report.documents import MARKUPS, verdicts_as
+from rl_yardstick.report.documents import MARKUPS, headline, verdicts_as
 from rl_yardstick.report.page.frame import Report, Section, setting
 from rl_yardstick.report.ranking import COLUMNS, OTHER_RETURNS, Column, Row, filled
-from rl_yardstick.report.series import (
-    AgentRuns,
-    Curve,
-    EnvironmentSeries,
-    linear_up_to,
-    mean_regret,
-    with_best_mean,
-)
-from rl_yardstick.report.words import number, seed_sentence
+from rl_yardstick.report.series import LINEAR, SCORES, STRETCHED, Curve, EnvironmentSeries
+from rl_yardstick.report.words import number, seed_sentence, with_best_mean
 
-WIDTH, HEIGHT = 200, 100  # of a small figure, in the drawing's own unit
-
-
-def overview(report: Report) -> Section | None:
-    """All environments side by side, each as a small figure; None for a single one."""
-    environments = report.series.environments
-    if len(environments) < 2:
-        return None
-    figures = [_small_figure(one) for one in environments]
-    agents = [label for label in report.series.marks if any(label in f["lines"] for f in figures)]
-    context = {"figures": figures, "agents": agents, "width": WIDTH, "height": HEIGHT}
-    return Section("overview", "Environments", context, data={})
-
-
-def _small_figure(one: EnvironmentSeries) -> dict[str, Any]:
-    """By agent the points of an SVG polyline, and the distance of the optimum from the top."""
-    curves: Mapping[str, Curve] = {}
-    linear, optimum = None, None
-    if one.pulls is not None:
-        what = "cumulative regret by pull"
-        curves = {agent: mean_regret(found) for agent, found in one.pulls.pulls.items()}
-    else:
-        what, optimum = "return of evaluations", one.environment.optimum
-        if one.curves is not None:
-            found = one.curves["evaluation"]
-            what += f" by {found.budget}"
-            curves, linear = found.by_axis[found.budget], found.linear_up_to
-    heights = {agent: _compressed(curve.y, linear) for agent, curve in curves.items()}
-    best = _compressed(np.array([] if optimum is None else [optimum]), linear)
-    known = np.concatenate([best, *heights.values()])
-    known = known[np.isfinite(known)]
-    low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
-    last = max((float(curve.x[-1]) for curve in curves.values()), default=1.0) or 1.0
-
-    def down(height: float) -> float:
-        # The distance from the top, with a margin for the width of a line.
-        return 4 + (HEIGHT - 8) * (high - height) / ((high - low) or 1.0)
-
-    lines = {}
-    for agent, curve in curves.items():
-        known_points = zip(WIDTH * curve.x / last, heights[agent], strict=True)
-        points = [f"{x:.1f},{down(y):.1f}" for x, y in known_points if math.isfinite(y)]
-        lines[agent] = " ".join(points)
-    optimum = down(float(best[0])) if best.size else None
-    return {"name": one.environment.environment, "what": what, "lines": lines, "optimum": optimum}
-
-
-def _compressed(values: Floats, linear: float | None) -> Floats:
-    """Heights on an axis that is logarithmic beyond ``linear``, as in the large figure."""
-    if linear is None:
-        return values
-    size = np.maximum(np.abs(values) / linear, 1e-300)
-    return np.asarray(np.sign(values) * np.where(size <= 1, size, 1 + np.log10(size)))
+MOST_DOTS = 300  # of an agent on an environment; of more runs as many, evenly spaced by rank
 
 
 def verdict(report: Report) -> Section | None:
-    """For each environment the lead, the pairs as a matrix or sentences, and the notes."""
+    """The answer, all runs as dots, the words by pair, and for each environment its sentences."""
     analysis, environments = report.analysis, report.series.environments
     study, metric = analysis.study, METRIC_WORDS[analysis.study.metric]
-    cards = [
+    scores = [runs for one in analysis.environments if one.is_score for runs in one.scores.values()]
+    n_high = sum(int((runs >= SCORES[1]).sum()) for runs in scores)
+    is_stretched = 2 * n_high > sum(int(np.isfinite(runs).sum()) for runs in scores)
+    cards: list[dict[str, Any]] = [
         {
             "environment": one.environment,
             "conclusion": words.conclusion(study, one.environment),
             "pairs": words.pairs_both_ways(one.environment.pairs),
+            "dots": _dots(report, one.environment, is_stretched),
             "has_sweeps": bool(one.sweeps),
             "grids": {
                 name: {
@@ -106,8 +52,15 @@ def verdict(report: Report) -> Section | None:
         }
         for one in environments
     ]
+    tally: dict[tuple[str, str], Counter[str]] = {}
+    for names, pair in (item for card in cards for item in card["pairs"].items()):
+        tally.setdefault(names, Counter())[pair.text] += 1
     context = {
-        "general": [*words.overall_sentences(analysis), *words.places_without_a_run(analysis)],
+        "answer": [*words.answer(analysis), *words.places_without_a_run(analysis)],
+        "tally": tally,
+        "is_stretched": is_stretched,
+        "most_dots": MOST_DOTS,
+        "headline": headline(analysis),
         "cards": cards,
         "unseen": words.unseen_sentence(analysis),
         "metric": metric,
@@ -115,6 +68,26 @@ def verdict(report: Report) -> Section | None:
     files = {name: verdicts_as(name, analysis, report.command) for name in MARKUPS}
     data = {"files": files, "metric": metric, "sweeps": [_sweeps(one) for one in environments]}
     return Section("verdict", "Verdict", context, data)
+
+
+def _dots(report: Report, one: EnvironmentAnalysis, is_stretched: bool) -> dict[str, Any]:
+    """The ticks of an axis from 0 to 1, and for each agent its runs on it, its median and cost."""
+    agents = [agent for agent in one.agents if not math.isnan(agent.runs.mean)]
+    values = [one.scores[agent.agent] * (-1 if one.is_cost else 1) for agent in agents]
+    knots: Sequence[float] = SCORES if is_stretched else LINEAR
+    places: Sequence[float] = STRETCHED if is_stretched else LINEAR
+    if not one.is_score and agents:
+        every = np.concatenate(values)
+        knots, places = sorted({float(np.nanmin(every)), float(np.nanmax(every))}), (0, 1)
+    costs, rows = words.processor_seconds(report.analysis.results), []
+    for agent, runs in zip(agents, values, strict=True):
+        ranked = np.argsort(runs)[: np.isfinite(runs).sum()]
+        shown = ranked[np.linspace(0, len(ranked) - 1, min(len(ranked), MOST_DOTS)).astype(int)]
+        *at, median = np.interp([*runs[shown], np.nanmedian(runs)], knots, places[: len(knots)])
+        dots = zip(at, shown + report.analysis.study.first_seed, runs[shown], strict=True)
+        cost = costs.get((agent.agent, one.environment))
+        rows.append((agent, [*dots], median, "" if cost is None else words.duration(cost)))
+    return {"rows": rows, "ticks": [*zip(places, map(number, knots), strict=False)]}
 
 
 def _sweeps(one: EnvironmentSeries) -> dict[str, dict[str, Any]]:
@@ -187,47 +160,23 @@ def _at(curve: Curve, share: float) -> dict[str, float]:
     return {name: values[nearest] for name, values in vars(curve).items()}
 
 
-# With more runs of an agent than this, the page shows only their mean.
-MOST_DOTS = 300
-
-
 def comparison(report: Report) -> Section | None:
-    """Intervals and each run as figures, the pairs as a table and as a matrix."""
+    """The pairs as a table, with differences, their intervals and the seeds to decide."""
     study = report.analysis.study
-    metric, is_cost = METRIC_WORDS[study.metric], study.metric in COSTS
-    context = {"metric": metric, "most_dots": MOST_DOTS, "lower_is_better": is_cost}
-    places = [
-        {
-            "intervals": [_runs(agent) for agent in one.runs],
-            "words": {f"{p.first} | {p.second}": p.text for p in one.environment.pairs},
-            "linear": linear_up_to((runs.values for runs in one.runs), one.environment.optimum),
-        }
-        for one in report.series.environments
-    ]
-    data = {"metric": metric}
-    return Section("comparison", "Differences", context, data, places, by_environment=True)
-
-
-def _runs(agent: AgentRuns) -> dict[str, Any]:
-    """The mean, and each run unless there are too many to see."""
-    shown = slice(0 if len(agent.values) > MOST_DOTS else None)
-    runs = {"seeds": agent.seeds[shown], "runs": agent.values[shown]}
-    return {"agent": agent.agent, **vars(agent.mean), **runs}
+    if not any(one.pairs for one in report.analysis.environments):
+        return None
+    context = {"metric": METRIC_WORDS[study.metric], "lower_is_better": study.metric in COSTS}
+    return Section("comparison", "Differences", context, by_environment=True)
 
 
 def overall(report: Report) -> Section | None:
-    """Aggregates, profiles and the score on each environment; None for a single environment."""
+    """Aggregates, profiles and pairs over all environments; None for a single environment."""
     overall = report.analysis.overall
     if overall is None:
         return None
     agents = list(overall.scores)
-    scores = [
-        {agent.agent: agent.score for agent in one.agents if agent.score is not None}
-        for one in report.analysis.environments
-    ]
     context = {
         "agents": agents,
-        "scores": scores,
         "pairs": words.pairs_both_ways(overall.pairs),
         "unproven": words.unproven_sentences(report.analysis.environments),
     }

@@ -24,14 +24,7 @@ from rl_yardstick.pipeline.files import read_arrays, read_bytes, read_json
 from rl_yardstick.pipeline.run import MEANINGS
 from rl_yardstick.report.films import films_of, has_film
 from rl_yardstick.report.page.frame import Report, Section, data_uri, first_runs, layout_data
-from rl_yardstick.report.series import (
-    SPREAD,
-    Curve,
-    Pulls,
-    mean_of,
-    mean_regret,
-    regret_of_runs,
-)
+from rl_yardstick.report.series import SPREAD, Curve, Pulls, mean_of, mean_regret, regret_of_runs
 from rl_yardstick.report.words import number, whys_of
 
 MOST_ARMS = 40  # over all contexts, in a table or in a figure

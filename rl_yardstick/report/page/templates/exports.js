@@ -77,13 +77,13 @@
     return lines.map((line) => line.map(quoted).join(",")).join("\n") + "\n";
   };
 
-  document.querySelectorAll("figure table").forEach((table) => {
+  document.querySelectorAll("figure .scroll table").forEach((table) => {
     const button = document.createElement("button");
     button.type = "button";
     button.className = "export screen-only";
     button.textContent = "Save as CSV";
     button.addEventListener("click", () => {
-      const name = `${fileName(table, placeOf(table, "figure table"))}.csv`;
+      const name = `${fileName(table, placeOf(table, "figure .scroll table"))}.csv`;
       report.download(name, new Blob([report.csv(table)], { type: "text/csv" }));
     });
     table.closest(".scroll").after(button);

@@ -1,5 +1,15 @@
-// Means by a swept parameter, and the export of all verdicts.
+// The choice of an environment, means by a swept parameter, and the export of all verdicts.
 report.section("verdict", (root, { files, metric, sweeps }) => {
+  const buttons = [...root.querySelectorAll("[data-choose]")];
+  const mark = () => buttons.forEach((button, i) => button.setAttribute("aria-pressed", String(i === report.environment)));
+  buttons.forEach((button, i) =>
+    button.addEventListener("click", () => {
+      document.getElementById("environment").value = i;
+      report.choose(i);
+    }),
+  );
+  report.onChange(mark);
+  mark();
   root.querySelectorAll(".plot").forEach((element) => {
     const curves = Object.entries(sweeps[element.dataset.card]);
     const values = [...new Set(curves.flatMap(([, curve]) => curve.x))].sort((a, b) => a - b);
