@@ -195,8 +195,8 @@ def _legend(analysis: StudyAnalysis) -> str:
             what += f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
             what = " ".join([what, *words.unproven_sentences(environments)])
     text = (
-        f"{what} ±: the standard deviation of runs. Bold: the best agents, where another is shown "
-        "to be worse on average."
+        f"{what} ±: the standard deviation of runs. Bold: the best agents, where another is "
+        "worse."
     )
     if words.processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
@@ -206,7 +206,7 @@ def _legend(analysis: StudyAnalysis) -> str:
 def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, Cell]:
     """The cell of each agent that has a run."""
     best = environment.best.agents
-    is_for_all = len(best) == len(environment.agents)  # nobody is shown to be worse
+    is_for_all = len(best) == len(environment.agents)  # none is worse
     if is_for_all or words.none_has_learnt(analysis.study, environment):
         best = ()
     costs, cells = words.processor_seconds(analysis.results), {}
