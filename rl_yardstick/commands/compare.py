@@ -244,7 +244,7 @@ def do_study(
         failures |= do_runs(to_do, job.workers, job.command, job.console, job.stop)
     finally:
         if job.stop.number:
-            again = f"{cli.called_as('compare')} --resume {job.root}"
+            again = cli.to_copy("compare", "--resume", job.root)
             job.console.print(f"stopped; continue with: {again}")
     from rl_yardstick.experiments.results import read_results
 
@@ -316,7 +316,7 @@ def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
 
     print_analysis(console, analysis)
     if failed := worst_failed_run(results):
-        console.print(f"why the worst run failed: {cli.called_as('explain')} {failed}")
+        console.print(f"why the worst run failed: {cli.to_copy('explain', failed)}")
     with console.status("writing the tables"):
         files = [*write_tables(results), *write_verdicts(analysis, job.command)]
     blocks = None

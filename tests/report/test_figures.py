@@ -32,7 +32,7 @@ from rl_yardstick.report.series import (
 from tests.report import made_up
 
 GREY = "#595959"
-NAMED = {**dict(zip(COLOURS, ("blue", "orange", "green"), strict=False)), GREY: "grey"}
+NAMED = {**dict(zip(COLOURS, ("blue", "red", "green"), strict=False)), GREY: "grey"}
 THIRD = np.array([0.0, 0.5, 1.0])
 PULLS = np.array([1, 10, 100])
 BOUNDS = RegretBounds(PULLS, np.array([10.0, 30.0, 90.0]), np.array([0.0, 5.0, 10.0]))
