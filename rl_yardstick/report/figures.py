@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch, Rectangle
@@ -46,7 +45,6 @@ from rl_yardstick.report.series import (
     Mark,
     PullSeries,
     StudySeries,
-    linear_up_to,
     mean_regret,
     regret_of_runs,
     with_best_mean,
@@ -318,7 +316,7 @@ def draw_belief(panels: Sequence[Axes], belief: Belief) -> None:
     shared_legend(*panels)
 
 
-# Figures of any study: learning curves, runs, swept parameters, blocks of episodes, profiles.
+# Figures of any study: learning curves, runs, swept parameters, profiles.
 
 _AXES = {"step": "environment steps", "episode": "episodes"}
 
@@ -329,7 +327,6 @@ LONGEST = 20  # letters of a value on an axis
 MOST_TICKS = 8  # the largest number of values of a parameter with a tick each
 _BETWEEN = "; the optimum lies between the lines"
 FEW = 3  # the largest number of names in a legend's entry
-BLOCKS = {"average": "-", "minimum": ":", "maximum": "--"}
 
 
 def panels(curves: Mapping[str, LearningCurves]) -> list[tuple[str, str]]:
@@ -551,18 +548,15 @@ MOST_LINES = 14
 MOST_IN_PAIRS = 8  # the largest number of panels in two columns; more are in three
 
 
-def write_figures(series: StudySeries, episodes_table: pd.DataFrame | None) -> list[Path]:
-    """Draw all figures that the study's runs allow into its folder ``figures``; return the files.
-
-    ``episodes_table`` is the result of `report.series.episodes_table`, or None for no such figure.
-    """
+def write_figures(series: StudySeries) -> list[Path]:
+    """Draw all figures that a study's runs allow into its folder ``figures``; return the files."""
     files = FigureFiles(series.analysis.results.root / "figures", series.analysis.study.figures)
     files.folder.mkdir(exist_ok=True)
     for one in series.environments:
         if one.pulls is not None:
             _bandit_figures(files, one.pulls, one.environment.environment, series.marks)
     for one in series.environments:
-        _study_figures(files, series, one, episodes_table)
+        _study_figures(files, series, one)
     if (overall := series.analysis.overall) is not None:
         with files.figure("performance_profiles") as (axes,):
             for agent, shares in overall.profiles.items():
@@ -576,9 +570,7 @@ def write_figures(series: StudySeries, episodes_table: pd.DataFrame | None) -> l
     return files.written
 
 
-def _study_figures(
-    files: FigureFiles, series: StudySeries, one: EnvironmentSeries, blocks: pd.DataFrame | None
-) -> None:
+def _study_figures(files: FigureFiles, series: StudySeries, one: EnvironmentSeries) -> None:
     environment, metric, marks = one.environment, series.analysis.study.metric, series.marks
     name = file_name(environment.environment)
     if one.sweeps:
@@ -596,31 +588,6 @@ def _study_figures(
             draw_learning_curves(places, one, marks)
     with files.figure(f"{name}_intervals") as (axes,):
         draw_runs(axes, one, metric, marks)
-    if blocks is not None:
-        rows = blocks[blocks["environment"] == environment.environment]
-        _block_figure(files, f"{name}_episodes", rows, marks)
-
-
-def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Marks) -> None:
-    found = {str(agent): found for agent, found in rows.groupby("agent", sort=False)}
-    if not found:
-        return
-    n_columns = min(len(found), 2 if len(found) <= MOST_IN_PAIRS else 3)
-    curves = [each[column].to_numpy(float) for each in found.values() for column in BLOCKS]
-    with files.figure(name, n_columns, -(-len(found) // n_columns), height=2.2) as places:
-        for axes in places[1 : len(found)]:
-            axes.sharey(places[0])
-        for axes, (agent, blocks) in zip(places, found.items(), strict=False):
-            words = _set_scale(axes, linear_up_to(curves, None))
-            look: Any = {"marker": "o", "markersize": 3, "color": COLOURS[marks[agent].colour]}
-            for column, style in BLOCKS.items():
-                axes.plot(blocks["episode"], blocks[column], style, **look)
-            lettering(axes, title=agent, x="episode", y=f"return{words}")
-        for axes in places[len(found) :]:
-            axes.set_visible(False)
-        for label, style in BLOCKS.items():
-            places[0].plot([], [], style, marker="o", ms=3, color=REFERENCE, label=label)
-        shared_legend(places[0])
 
 
 def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Marks) -> None:

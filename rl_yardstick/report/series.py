@@ -32,9 +32,9 @@ from rl_yardstick.verdicts import UNBOUNDED, Bounds, Estimate
 # From this ratio on, the largest values flatten the rest of a linear axis: two decades.
 DWARFED = 100
 
-# Colours for kinds of agents, of which colour-blind readers too can tell lines and pale bands apart:
+# Colours for kinds of agents, of which colour-blind readers can tell lines and pale bands apart:
 # blue, red, green, wine, cyan, black, indigo. Behind them, from dark to light, those of viridis for
-# agents swept over a number. The page's style sheet repeats all, and has others for the dark theme.
+# agents swept over a number. The page's style sheet repeats them, with others for the dark theme.
 N_KINDS, N_STEPS = 7, 8
 COLOURS = (
     *("#0072B2", "#EE6677", "#2CA02C", "#882255", "#17BECF", "#000000", "#332288"),
@@ -44,8 +44,8 @@ COLOURS = (
 LEAST_VALUES = 3  # the smallest number of values of a swept parameter for colours and a figure
 
 Dash = Literal["solid", "dash", "dashdot", "dot"]
-# Seven colours of kinds and four line styles repeat together: neighbours differ in both, so lines differ in
-# greyscale, too, and 28 agents have distinct marks.
+# The colours of kinds and four line styles repeat together: neighbours differ in both, so lines
+# differ in greyscale, too, and 28 agents have distinct marks.
 DASHES: tuple[Dash, ...] = ("solid", "dash", "dashdot", "dot")
 
 

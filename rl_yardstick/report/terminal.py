@@ -223,34 +223,15 @@ def _caption(study: StudySpec, one: EnvironmentAnalysis, left_out: Sequence[str]
 
 
 def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:
-    """Print the table of `episodes_table`, with as many agents side by side as fit."""
-    for environment, rows in table.groupby("environment", sort=False):
-        title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
-        left = list(dict.fromkeys(rows["agent"]))
-        while left:
-            for n in range(len(left), 0, -1):
-                printed = _episodes(title, rows, left[:n])
-                if (needed := _width(console, printed)) <= console.width:
-                    break
-            printed.width = needed if needed > console.width else None
-            console.print()
-            console.print(printed, crop=False)
-            left = left[n:]
-
-
-def _episodes(title: str, rows: pd.DataFrame, agents: Sequence[str]) -> Table:
-    printed = Table(title=title, title_justify="left")
-    printed.add_column("episode", justify="right")
-    for agent in agents:
-        printed.add_column(folded(str(agent), MOST_AGENT_WIDTH), justify="right", no_wrap=True)
-    figures = rows.set_index(["episode", "agent"])[["average", "minimum", "maximum"]]
-    texts = [_aligned(_with_equal_decimals([*map(number_cell, figures[one])])) for one in figures]
-    widths = [max(map(len, column)) for column in texts]
-    padded = [[f"{one:<{n}}" for one in column] for n, column in zip(widths, texts, strict=True)]
-    cells = dict(zip(figures.index, map("  ".join, zip(*padded, strict=True)), strict=True))
-    for episode in sorted(set(rows["episode"])):
-        printed.add_row(f"{episode:,}", *(cells.get((episode, agent), "-") for agent in agents))
-    return printed
+    """Print the table of `episodes_table`, one for each agent on each environment."""
+    for (environment, agent), rows in table.groupby(["environment", "agent"], sort=False):
+        cells = {"episode": [f"{episode:,}" for episode in rows["episode"]]}
+        for heading in ("average", "minimum", "maximum"):
+            cells[heading] = _with_equal_decimals([*map(number_cell, rows[heading])])
+        printed, _ = _fitting(console, cells, ())
+        printed.title = f"{agent} on {environment}: return per {width} episodes, all seeds"
+        console.print()
+        console.print(printed, crop=False)
 
 
 def _width(console: Console, table: Table) -> int:

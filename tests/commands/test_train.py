@@ -104,11 +104,14 @@ def test_what_to_type_next(monkeypatch):
     typed = build_parser().parse_args(
         ["--env-kwargs", "is_slippery:False", "-n", "500", "-conf", "my.yml"]
     )
+    told = (
+        "compare  python compare.py --env FrozenLake-v1 --algos qlearning sarsa --env-kwargs \\\n"
+    )
+    told += "    is_slippery:False --n-timesteps 500 --conf-file qlearning:my.yml"
     assert next_commands(run, lake, True, typed) == [
         f"watch    python enjoy.py '{run.path}'",
         f"explain  python -m rl_yardstick explain '{run.path}'",
-        "compare  python compare.py --env FrozenLake-v1 --algos qlearning sarsa --env-kwargs \\\n"
-        "    is_slippery:False --n-timesteps 500 --conf-file qlearning:my.yml",
+        told,
     ]
     resumed = build_parser().parse_args(["--gym-packages", "mine"])  # typed with the first command
     (watched,) = next_commands(run, lake, False, resumed)

@@ -89,8 +89,8 @@ def test_the_page_is_one_file_that_says_what_won(tmp_path):
     for part in (
         "Best setting: trial 2. On 4 seeds that the search has not seen, its mean score is 0.7;",
         "Trial 2 gains <strong>+0.2</strong> on unseen seeds",
-        "(95 % interval +0.1 to +0.3): "
-        '<span class="chip better">better so far</span>; 1 of its 4 runs failed',
+        "(95 % interval +0.1 to +0.3): <",
+        ">better so far</span>; 1 of its 4 runs failed",
         "<code>python train.py --conf-file winner.yml</code>",
         "Changed: <code>learning_rate: 2</code> (0 before), <code>tau: 1.0</code> (not set before)",
         "looked better in the search than on other seeds, by 0.1",
