@@ -350,7 +350,7 @@ def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
     speed = f"{n_steps / max(taken, 1e-9):,.0f} steps/s"
     text = f"{n_steps:,} steps in {taken:.1f} s of processor time ({speed})"
     rows = [("trained", text)]
-    if outcome.engine:
+    if outcome.engine and not hasattr(outcome.agent, "engine_plan"):  # told before the training
         rows.append(("engine", outcome.engine))
     if evaluation.best is not None:
         yardstick = None if final is None else final.yardstick
@@ -400,9 +400,14 @@ def next_commands(
 
 def rival(spec: TrainSpec) -> str:
     """An agent to compare with, of those with hyperparameters for the environment if possible."""
-    known = fitting(spec.env_id, spec.env_kwargs)
-    found = [name for names in known for name in RIVALS if name in names and name != spec.algo]
-    return found[0] if found else "random"
+    from rl_yardstick.pipeline.environments import MISTAKES
+
+    with suppress(*MISTAKES):  # of an environment that cannot be made a second time
+        for names in fitting(spec.env_id, spec.env_kwargs):
+            for name in RIVALS:
+                if name in names and name != spec.algo:
+                    return name
+    return "random"
 
 
 # --- the lists of agents and environments ---------------------------------------------------------

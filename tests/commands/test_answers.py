@@ -29,31 +29,6 @@ def test_training_by_the_installed_name(type_command, tmp_path):
     assert written == f"yardstick train {shlex.join(words)}\n"
 
 
-RUN, SHORT = "logs/qlearning/FrozenLake-v1_1", "--env FrozenLake-v1 -n 500 -j 1 --no-report"
-PRINTING = (
-    *(f"{command} --help" for command in COMMANDS),
-    "train --list --env FrozenLake-v1",
-    "train --algo qlearning --env FrozenLake-v1 -n 500 --seed 0 --watch-learning",
-    "train --algo ppo --env Warehouse-v0 -n 256 --seed 0 -params n_envs:2",
-    f"enjoy {RUN} --n-episodes 1",
-    f"explain {RUN}",
-    f"inspect {RUN}/FrozenLake-v1.zip",
-    "shaping --env Warehouse-v0 --algo ppo",
-    "audit --algo sarsa --kind q_learning --seeds 1",
-    f"compare --algos qlearning sarsa expected_sarsa --seeds 2 {SHORT}",
-    f"tune --algo qlearning --trials 3 --seeds-per-trial 1 --retest-seeds 2 {SHORT}",
-)
-
-
-def test_no_line_in_a_pipe_is_too_wide(type_command, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    for words in PRINTING:
-        code, out, err = type_command("yardstick", *words.split())
-        assert code in (0, 1), err
-        for line in out.splitlines():
-            assert len(line) <= (80 if line[:1] in tuple("┏┃┡│└") else 100), words
-
-
 def test_its_version(type_command):
     assert type_command("yardstick", "--version") == (0, f"{version('rl-yardstick')}\n", "")
 
@@ -113,3 +88,12 @@ def test_mistakes_are_one_line(line, said, type_command, tmp_path, request):
     assert set(tmp_path.rglob("*")) == before
     assert len(err) < 1200
     assert not (out and "audit" in line)
+
+
+def test_no_line_in_a_pipe_is_too_wide(type_command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for words in [*(f"{command} --help" for command in COMMANDS), *TABLE["right"]]:
+        code, out, err = type_command("yardstick", *words.split())
+        assert code in (0, 1), err
+        for line in filter(lambda line: " " in line.strip(), out.splitlines()):
+            assert len(line) <= (80 if line[:1] in tuple("┏┃┡│└") else 100), words

@@ -36,7 +36,7 @@ from rl_yardstick.safe_files.files import read_members
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
     """The template's variables whose words depend on the data."""
     if data["kind"] == "maps":
-        n_shown, n_units = len(data["moments"]["number"]), data["n_units"]
+        n_shown, n_units = len({*data["moments"]["number"]}), data["n_units"]
         extent = f"{n_shown:,} of {_count(n_units, 'evaluation')}"
         return {"kind": "from evaluation to evaluation", "extent": extent, "note": ""}
     steps, note = data["steps"]["timesteps"], ""
