@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 ENV = "CartPole-v1"
 # Agents for a comparison with a run, the first that fits; these train quickly.
-RIVALS = ("qlearning", "sarsa", "semi_gradient_sarsa", "sac", "ppo", "thompson", "ucb")
+RIVALS = ("thompson", "ucb", "qlearning", "sarsa", "semi_gradient_sarsa", "sac", "ppo")
 RESUMED = "this run, or the newest unfinished one of --algo and --env"
 PAGE = "learning.html"
 WATCH = f"write a page that plays the training ({PAGE} in the run folder)"
