@@ -223,12 +223,10 @@ def whole_zip(path: Path) -> str:
 
 def _page(args: argparse.Namespace) -> str | None:
     """The path of the page of ``--watch-learning``: a name in the run folder, or absolute."""
-    if args.watch_learning is None:
-        if not args.watch_episodes:
-            return None
+    if args.watch_learning is None and args.watch_episodes:
         raise UserError("--watch-episodes needs --watch-learning")
     if not args.watch_learning:
-        return PAGE
+        return None if args.watch_learning is None else PAGE
     path = Path(args.watch_learning)
     if path.suffix != ".html" or path.is_dir():
         raise UserError(f"--watch-learning writes a .html file, not {path.name!r}")
