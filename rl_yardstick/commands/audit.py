@@ -111,6 +111,6 @@ def verdict_lines(verdict: Verdict) -> list[str]:
     for finding in verdict.faults:
         fault = FAULTS[finding.fault]
         told = f"measured: {finding.text}; right would be: {finding.right}"
-        lines += [f"fault: {finding.fault}. {fault.sentence}", f"  {told}"]
-        lines += [f"  see: {fault.source}"]
+        lines += [f"fault: {finding.fault}. {fault.sentence}"]
+        lines += [f"  {told}", f"  see: {fault.source}"]
     return lines

@@ -56,7 +56,7 @@ def called_as(command: str) -> str:
 def to_copy(command: str, *words: object) -> str:
     """A command to copy into a shell; a long one goes on behind backslashes."""
     quoted = [shlex.quote(str(word)).replace(" ", "\0") for word in words]
-    whole = {"break_long_words": False, "break_on_hyphens": False}
+    whole: Any = {"break_long_words": False, "break_on_hyphens": False}
     lines = textwrap.wrap(" ".join([called_as(command), *quoted]), 74, **whole)
     return " \\\n    ".join(lines).replace("\0", " ")
 

@@ -66,17 +66,14 @@ def table_console() -> Console:
 
 
 def wrapped(text: str, width: int = LINE) -> str:
-    """A text with its long lines broken between words; a longer word, such as a path, stays whole.
-
-    The next lines hang below the words behind a short label, or are indented by two more columns.
-    """
+    """A text with long lines broken between words, and hung behind a label; a path stays whole."""
     lines = text.split("\n")
     for place, line in enumerate(lines):
         if len(line) > width:
             label = re.match(r" *\S+ {2,}", line)
             hang = len(line) - len(line.lstrip()) + 2
             hang = label.end() if label and label.end() <= LONGEST_LABEL else hang
-            whole = {"break_long_words": False, "break_on_hyphens": False}
+            whole: Any = {"break_long_words": False, "break_on_hyphens": False}
             lines[place] = textwrap.fill(line, width, subsequent_indent=" " * hang, **whole)
     return "\n".join(lines)
 

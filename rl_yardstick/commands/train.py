@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from rl_yardstick.pipeline.training import Training
 
 ENV = "CartPole-v1"
-# Agents for a comparison with a run, the first that fits; these train quickly.
-RIVALS = ("thompson", "ucb", "qlearning", "sarsa", "semi_gradient_sarsa", "sac", "ppo")
 RESUMED = "this run, or the newest unfinished one of --algo and --env"
 PAGE = "learning.html"
 WATCH = f"write a page that plays the training ({PAGE} in the run folder)"
@@ -99,10 +97,13 @@ def main() -> int:
     is_for_one = args.env is not None
     args.env = args.env if is_for_one else ENV
     cli.import_typed(args)
+    from rl_yardstick.commands.terminal import TextConsole, table_console
+
     if args.list:
-        print_lists(args.env if is_for_one else "")
+        from rl_yardstick.report.catalogue import print_lists
+
+        print_lists(table_console(), args.env if is_for_one else "")
         return 0
-    from rl_yardstick.commands.terminal import TextConsole
     from rl_yardstick.pipeline.run import Run, Stop
 
     stop = Stop().listen()
@@ -135,7 +136,7 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
                 run.console.print(f"stopped; resume with: {again}")
             raise
         if not run.console.quiet:
-            print_outcome(run.console, spec, run, outcome, args)
+            print_outcome(run, spec, outcome, args)
     return 0
 
 
@@ -313,12 +314,11 @@ def print_engine(parts: Training) -> None:
         parts.run.console.print(f"engine   {plan}{other}", style="dim", soft_wrap=True)
 
 
-def print_outcome(
-    console: Console, spec: TrainSpec, run: Run, outcome: Training, args: argparse.Namespace
-) -> None:
+def print_outcome(run: Run, spec: TrainSpec, outcome: Training, args: argparse.Namespace) -> None:
     """Print what was done, below it the result, and the commands to type next."""
     from rl_yardstick.commands.terminal import describe_others, result_lines, say
 
+    console = run.console
     for label, text in rows_of(run, outcome):
         say(console, f"{label:<9}{text}")
     results = [] if outcome.pulled is None else [describe_pulls(outcome.pulled)]
@@ -368,8 +368,7 @@ def describe_pulls(pulls: PullSummary) -> str:
     from rl_yardstick.pipeline.run import LAST_PULLS
 
     if pulls.regret is not None and pulls.optimal is not None:
-        last = min(LAST_PULLS, pulls.n_pulls)
-        best = f"best arm in {percent(pulls.optimal)} of the last {last}"
+        best = f"best arm in {percent(pulls.optimal)} of the last {min(LAST_PULLS, pulls.n_pulls)}"
         return f"regret {pulls.regret:,.2f} over {pulls.n_pulls:,} pulls{APART}{best}"
     if pulls.reward is None:
         return f"regret not known: none of {pulls.n_pulls:,} pulls is in the log"
@@ -377,89 +376,19 @@ def describe_pulls(pulls: PullSummary) -> str:
     return f"regret not known{APART}reward {pulls.reward:.4f} a pull over the {known}"
 
 
-def next_commands(
-    run: Run, spec: TrainSpec, can_be_explained: bool, args: argparse.Namespace
-) -> list[str]:
+def next_commands(run: Run, spec: TrainSpec, explained: bool, args: Any) -> list[str]:
     """Commands to type next, in the working directory of the training."""
+    from rl_yardstick.report.catalogue import rival
+
     more = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
-    told = [f"watch    {cli.to_copy('enjoy', run.path, *more)}"]
-    if can_be_explained:
-        told.append(f"explain  {cli.to_copy('explain', run.path, *more)}")
+    labels = ("watch    ", "enjoy"), ("explain  ", "explain")
+    told = [f"{label}{cli.to_copy(name, run.path, *more)}" for label, name in labels]
+    told = told[: 1 + explained]
     if spec.env_kwargs and not args.env_kwargs:  # of a file, or typed before the run was resumed
         return told
-    for name in ("env_kwargs", "n_timesteps", "n_episodes"):
-        value = getattr(args, name)
-        typed = value if isinstance(value, list) else [value] if value > 0 else []
-        more += [f"--{name.replace('_', '-')}", *typed] if typed else []
+    more += ["--env-kwargs", *args.env_kwargs] if args.env_kwargs else []
+    more += ["--n-timesteps", args.n_timesteps] if args.n_timesteps > 0 else []
+    more += ["--n-episodes", args.n_episodes] if args.n_episodes > 0 else []
     more += ["--conf-file", f"{spec.algo}:{args.conf_file}"] if args.conf_file else []
     words = ["--env", spec.env_id, "--algos", spec.algo, rival(spec), *more]
     return [*told, f"compare  {cli.to_copy('compare', *words)}"]
-
-
-def rival(spec: TrainSpec) -> str:
-    """An agent to compare with, of those with hyperparameters for the environment if possible."""
-    from rl_yardstick.pipeline.environments import MISTAKES
-
-    with suppress(*MISTAKES):  # of an environment that cannot be made a second time
-        for names in fitting(spec.env_id, spec.env_kwargs):
-            for name in RIVALS:
-                if name in names and name != spec.algo:
-                    return name
-    return "random"
-
-
-# --- the lists of agents and environments ---------------------------------------------------------
-
-
-def fitting(env_id: str, env_kwargs: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """The agents with hyperparameters for an environment, and the others that fit it."""
-    from rl_yardstick.agents import ALGORITHMS, fitting_algorithms
-    from rl_yardstick.agents.registry import is_bandit
-    from rl_yardstick.envs.wrappers import has_masks
-    from rl_yardstick.pipeline.environments import make_env
-    from rl_yardstick.pipeline.settings import entry_names
-
-    with closing(make_env(env_id, env_kwargs)) as env:
-        spaces = env.observation_space, env.action_space
-        found = fitting_algorithms(*spaces, is_bandit(env), has_masks(env))
-    tuned = [name for name in ALGORITHMS if env_id in entry_names(name)]
-    return tuned, [name for name in found if name not in tuned]
-
-
-def print_lists(env_id: str) -> None:
-    """Print agents, and environments with settings for some agent; of one, what fits it."""
-    import gymnasium as gym
-    from rich.table import Column, Table
-
-    from rl_yardstick.agents import ALGORITHMS
-    from rl_yardstick.commands.terminal import table_console
-    from rl_yardstick.pipeline.environments import check_env_id
-    from rl_yardstick.pipeline.settings import entry_names
-
-    ids = {one.id for one in gym.registry.values() if "rl_yardstick" in str(one.entry_point)}
-    ids = ids.union(*map(entry_names, ALGORITHMS)) & set(gym.registry)
-    ids -= {"ReplayBandit-v0"}  # its arms are those of a log
-    if env_id:
-        check_env_id(env_id)
-        ids = {env_id}
-    fit = {each: fitting(each, {}) for each in sorted(ids)}
-    told = "agents with hyperparameters for it; also: those that take the default ones"
-    places = [("environment (--env)", told)]
-    for each, (tuned, others) in fit.items():
-        lines = [" ".join(tuned), "also: " + " ".join(others) if others else ""]
-        places.append((each, "\n".join(filter(None, lines))))
-    agents = [("agent (--algo)", "what it is")]
-    for name in [name for names in fit[env_id] for name in names] if env_id else ALGORITHMS:
-        entry = ALGORITHMS[name]
-        missing = "" if entry.is_installed else f"  needs: {entry.install_command}"
-        agents.append((name, entry.summary + missing))
-    console = table_console()
-    for (first, second), *rows in (agents, places):
-        table = Table(Column(first, no_wrap=True), second, box=None, padding=(0, 2, 0, 0))
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
-        console.print()
-    if not env_id:
-        told = "Any environment of Gymnasium works where the spaces fit; see --gym-packages."
-        console.print(told)

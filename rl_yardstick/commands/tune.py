@@ -275,8 +275,6 @@ def print_opened(job: Job, search: Search) -> None:
     say(job.console, f"{words}, in {job.root}")
     if mark := unproven_mark(search.tuning):
         say(job.console, f"scores are{mark}")
-    for name in suggestions.space.widened:
-        say(job.console, f"{name}: the search space is widened to hold the shipped value")
 
 
 def print_search(console: Console, search: Search) -> None:
@@ -320,8 +318,7 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
 def to_train(tuning: TuningSpec, winner: Path | None) -> str:
     """The command that trains with the winner, or with the shipped settings if nothing is typed."""
     words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id]
-    if packages := tuning.study.gym_packages:
-        words += ["--gym-packages", *packages]
+    words += ["--gym-packages", *packages] if (packages := tuning.study.gym_packages) else []
     if path := winner or tuning.agent.conf_file:
         words += ["--conf-file", str(path)]
     return cli.to_copy("train", *words) if winner or not tuning.agent.settings else ""
@@ -329,8 +326,8 @@ def to_train(tuning: TuningSpec, winner: Path | None) -> str:
 
 def print_winner(console: Console, search: Search, number: int, path: Path) -> None:
     """Print how to train with the winner, and which of its settings differ from the shipped."""
-    say(console, f"winner: trial {number}, in {path}; to train with it:")
-    say(console, f"  {to_train(search.tuning, path)}")
+    how = to_train(search.tuning, path)
+    say(console, f"winner: trial {number}, in {path}; to train with it:\n  {how}")
     shipped, entry = search.suggestions.shipped, search.trials[number].user_attrs["settings"]
     for key in {**shipped, **entry}:
         before, now = (each.get(key, "left out") for each in (shipped, entry))
