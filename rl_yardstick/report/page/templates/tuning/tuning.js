@@ -31,7 +31,7 @@ report.section("history", (root, data) => {
     const lines = shipped === null ? [] : [{
       type: "line", xref: "paper", x0: 0, x1: 1, y0: shown(shipped), y1: shown(shipped),
       line: { color: muted, width: 1.4, dash: "dot" },
-      label: { text: `shipped ${report.number(shipped)}${isBeyond(shipped) ? ", beyond the edge" : ""}`, textposition: "end", xanchor: "right", yanchor: isCost ? "top" : "bottom", font: { size: 11, color: muted } },
+      label: { text: `shipped ${report.number(shipped)}${isBeyond(shipped) ? ", beyond the edge" : ""}`, textposition: "start", xanchor: "left", yanchor: isCost ? "top" : "bottom", font: { size: 11, color: muted } },
     }];
     return {
       traces: [
