@@ -46,6 +46,7 @@ if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
 
 MOST_AGENT_WIDTH, LEAST_AGENT_WIDTH = 20, 12
 UNBOUNDED = 10_000  # columns
+MOST_DIGITS = 6  # of a figure in a table
 # Columns to drop, in this order, while a table is wider than the terminal, and then all but the
 # first, from the right; the page has all.
 FIRST_LEFT_OUT = (
@@ -139,13 +140,18 @@ def _with_equal_decimals(cells: Sequence[Cell]) -> list[str]:
     """The texts of a column, in which all figures have as many decimals as the longest."""
     texts = [cell.in_line or cell.text for cell in cells]
     found = [_FIGURE.match(text) for text in texts]
-    fixed = partial(number, decimals=max(len(one[1] or "") for one in found if one))
+    decimals = max(len(one[1] or "") for one in found if one)
+    longest = max(len(one[0].partition(".")[0].strip("-").replace(",", "")) for one in found if one)
+    decimals = min(decimals, max(MOST_DIGITS - longest, 0))
+    fixed = partial(number, decimals=decimals)
     for place, (cell, one) in enumerate(zip(cells, found, strict=True)):
         if one and one[0] == number(cell.value):
             was, now = one[0], fixed(cell.value)
             if cell.estimate and interval(cell.estimate) in texts[place]:
                 was, now = interval(cell.estimate), interval(cell.estimate, fixed)
             texts[place] = texts[place].replace(was, now, 1)
+        elif one and one[0] == texts[place] and decimals:  # a score, which is rounded down
+            texts[place] = f"{one[0].partition('.')[0]}.{one[1] or '':0<{decimals}}"
     return texts
 
 
