@@ -46,7 +46,6 @@ if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
 
 MOST_AGENT_WIDTH, LEAST_AGENT_WIDTH = 20, 12
 UNBOUNDED = 10_000  # columns
-MOST_DIGITS = 6  # of a figure in a table
 # Columns to drop, in this order, while a table is wider than the terminal, and then all but the
 # first, from the right; the page has all.
 FIRST_LEFT_OUT = (
@@ -141,8 +140,6 @@ def _with_equal_decimals(cells: Sequence[Cell]) -> list[str]:
     texts = [cell.in_line or cell.text for cell in cells]
     found = [_FIGURE.match(text) for text in texts]
     decimals = max(len(one[1] or "") for one in found if one)
-    longest = max(len(one[0].partition(".")[0].strip("-").replace(",", "")) for one in found if one)
-    decimals = min(decimals, max(MOST_DIGITS - longest, 0))
     fixed = partial(number, decimals=decimals)
     for place, (cell, one) in enumerate(zip(cells, found, strict=True)):
         if one and one[0] == number(cell.value):
