@@ -112,7 +112,7 @@ class OneLineParser(argparse.ArgumentParser):
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse's; the words are kept for hints."""
-        self._typed = sys.argv[1:] if args is None else list(args)
+        self.typed = sys.argv[1:] if args is None else list(args)
         return super().parse_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
@@ -121,8 +121,8 @@ class OneLineParser(argparse.ArgumentParser):
         if surplus != message:
             flags = [name for action in self._actions for name in action.option_strings]
             words = surplus.split()
-            if words and words[0] in self._typed:  # with a value that was taken for a model
-                words = self._typed[self._typed.index(words[0]) :]
+            if words and words[0] in self.typed:  # with a value that was taken for a model
+                words = self.typed[self.typed.index(words[0]) :]
             text = hint(words, flags)
             message = f"unknown argument {surplus}{': ' if text else ''}{text}"
         raise UserError(f"{message} (see --help)")

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from rl_yardstick.pipeline.spec import TrainSpec
     from rl_yardstick.pipeline.training import Training
 
-ENV = "CartPole-v1"
 RESUMED = "this run, or the newest unfinished one of --algo and --env"
 PAGE = "learning.html"
 WATCH = f"write a page that plays the training ({PAGE} in the run folder)"
@@ -48,7 +47,7 @@ examples:
 FLAGS: Flags = {
     "": (
         flag("--algo", "agent (default: ppo; see --list)", default="ppo"),
-        flag("--env", f"environment id (default: {ENV}; see --list)"),
+        flag("--env", "environment id (default: CartPole-v1; see --list)", default="CartPole-v1"),
         switch("--list", "list agents and environments that fit each other; --env: for this one"),
     ),
     "budget and settings": (
@@ -93,15 +92,15 @@ def build_parser() -> OneLineParser:
 
 def main() -> int:
     """Train, resume or list."""
-    args = build_parser().parse_args()
-    is_for_one = args.env is not None
-    args.env = args.env if is_for_one else ENV
+    parser = build_parser()
+    args = parser.parse_args()
     cli.import_typed(args)
     from rl_yardstick.commands.terminal import TextConsole, table_console
 
     if args.list:
         from rl_yardstick.report.catalogue import print_lists
 
+        is_for_one = any(word.partition("=")[0] == "--env" for word in parser.typed)
         print_lists(table_console(), args.env if is_for_one else "")
         return 0
     from rl_yardstick.pipeline.run import Run, Stop
