@@ -38,7 +38,12 @@ PATTERNS = [(re.compile(key, re.IGNORECASE | re.MULTILINE), told) for key, told 
 
 def prose(page: str) -> str:
     """The sentences of a page in Markdown, without code, tables, formulas and comments."""
-    for unread in (r"(?ms)^(```|~~~|:::).*?^\1", r"(?s)<!--.*?-->", r"(?s)\$\$.*?\$\$", r"(?m)^\|.*$"):
+    for unread in (
+        r"(?ms)^(```|~~~|:::).*?^\1",
+        r"(?s)<!--.*?-->",
+        r"(?s)\$\$.*?\$\$",
+        r"(?m)^\|.*$",
+    ):
         page = re.sub(unread, "\n", page)
     page = re.sub(r"!\[[^\]]*\]\([^)]*\)|<[^>]+>", "", page)
     page = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", page)

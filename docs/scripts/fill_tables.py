@@ -34,7 +34,6 @@ from environment_facts import (  # noqa: E402
 from measured_tables import measured_block, timings_block  # noqa: E402
 
 
-
 def output_block(python: str, script: str, *words: str) -> str:
     """What a command of the checkout prints, as a block of text."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import textwrap
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands.cli import OneLineParser, flag, shared, whole_number, with_engine
@@ -34,9 +33,10 @@ def build_parser() -> OneLineParser:
     """The flags."""
     words = "Test an implementation for known bugs, on tiny worlds with exact values."
     spaces = ("discrete", "box")
+    kinds = f"the kind of algorithm (default: as its class): {', '.join(KINDS)}"
     flags = (
         *shared("--gym-packages", "--engine", "--hyperparams"),
-        flag("--kind", "the kind of algorithm (default: as its class)", choices=[*KINDS]),
+        flag("--kind", kinds, choices=[*KINDS], metavar="KIND"),
         flag("--observations", "numbers or vectors (default: what works)", choices=spaces),
         flag("--actions", "one of two, or a number (default: what works)", choices=spaces),
         flag("--seeds", "seeds for a probe that fails: the majority", whole_number(1, 100), 3),
@@ -112,6 +112,5 @@ def verdict_lines(verdict: Verdict) -> list[str]:
         fault = FAULTS[finding.fault]
         told = f"measured: {finding.text}; right would be: {finding.right}"
         lines += [f"fault: {finding.fault}. {fault.sentence}"]
-        lines += textwrap.wrap(told, 100, initial_indent="  ", subsequent_indent="  ")
-        lines += [f"  see: {fault.source}"]
+        lines += [f"  {told}", f"  see: {fault.source}"]
     return lines

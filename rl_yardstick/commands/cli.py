@@ -10,6 +10,7 @@ import importlib.util
 import os
 import shlex
 import sys
+import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
@@ -52,6 +53,14 @@ def called_as(command: str) -> str:
     return f"python {shlex.quote(str(beside))}"
 
 
+def to_copy(command: str, *words: object) -> str:
+    """A command to copy into a shell; a long one goes on behind backslashes."""
+    quoted = [shlex.quote(str(word)).replace(" ", "\0") for word in words]
+    whole: Any = {"break_long_words": False, "break_on_hyphens": False}
+    lines = textwrap.wrap(" ".join([called_as(command), *quoted]), 74, **whole)
+    return " \\\n    ".join(lines).replace("\0", " ")
+
+
 def command_line() -> str:
     """The command as it was typed, ready to be typed again."""
     program, *arguments = sys.argv
@@ -92,6 +101,7 @@ class OneLineParser(argparse.ArgumentParser):
         for command in COMMANDS:
             for typed in (f"python {command}.py", f"python -m rl_yardstick {command}"):
                 epilog = epilog.replace(typed, called_as(command))
+        description = textwrap.fill(description, 79)
         # No abbreviations: --seed would be taken for --seeds, which means something else.
         kwargs |= {"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter}
         super().__init__(description=description, epilog=epilog, **kwargs)
@@ -102,7 +112,7 @@ class OneLineParser(argparse.ArgumentParser):
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse's; the words are kept for hints."""
-        self._typed = sys.argv[1:] if args is None else list(args)
+        self.typed = sys.argv[1:] if args is None else list(args)
         return super().parse_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
@@ -111,8 +121,8 @@ class OneLineParser(argparse.ArgumentParser):
         if surplus != message:
             flags = [name for action in self._actions for name in action.option_strings]
             words = surplus.split()
-            if words and words[0] in self._typed:  # with a value that was taken for a model
-                words = self._typed[self._typed.index(words[0]) :]
+            if words and words[0] in self.typed:  # with a value that was taken for a model
+                words = self.typed[self.typed.index(words[0]) :]
             text = hint(words, flags)
             message = f"unknown argument {surplus}{': ' if text else ''}{text}"
         raise UserError(f"{message} (see --help)")

@@ -22,7 +22,6 @@ from rl_yardstick.commands.cli import (
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
 
 if TYPE_CHECKING:
-    import pandas as pd
     from rich.console import Console
 
     from rl_yardstick.experiments.analysis import StudyAnalysis
@@ -244,7 +243,7 @@ def do_study(
         failures |= do_runs(to_do, job.workers, job.command, job.console, job.stop)
     finally:
         if job.stop.number:
-            again = f"{cli.called_as('compare')} --resume {job.root}"
+            again = cli.to_copy("compare", "--resume", job.root)
             job.console.print(f"stopped; continue with: {again}")
     from rl_yardstick.experiments.results import read_results
 
@@ -316,15 +315,13 @@ def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
 
     print_analysis(console, analysis)
     if failed := worst_failed_run(results):
-        console.print(f"why the worst run failed: {cli.called_as('explain')} {failed}")
+        console.print(f"why the worst run failed: {cli.to_copy('explain', failed)}")
     with console.status("writing the tables"):
         files = [*write_tables(results), *write_verdicts(analysis, job.command)]
-    blocks = None
     if width:
         from rl_yardstick.report.series import episodes_table
 
-        blocks = episodes_table(results, width)
-        print_episodes_table(console, blocks, width)
+        print_episodes_table(console, episodes_table(results, width), width)
     if results.study.render_every:
         from rl_yardstick.report.films import write_films
 
@@ -334,13 +331,13 @@ def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
         for reason in refused:
             console.print(f"no film: {reason}")
     if job.with_page:
-        files += _draw(job, analysis, blocks)
+        files += _draw(job, analysis)
     console.print(f"\nfiles: {results.root}")
     for path in files:
         console.print(f"  {path.relative_to(results.root)}")
 
 
-def _draw(job: Job, analysis: StudyAnalysis, blocks: pd.DataFrame | None) -> list[Path]:
+def _draw(job: Job, analysis: StudyAnalysis) -> list[Path]:
     """Draw the figures and write the page; return the files."""
     from rl_yardstick.report.figures import write_figures
     from rl_yardstick.report.page import write_report
@@ -350,7 +347,7 @@ def _draw(job: Job, analysis: StudyAnalysis, blocks: pd.DataFrame | None) -> lis
     root = analysis.results.root
     with job.console.status("drawing the figures"):
         series = study_series(analysis)
-        files = write_figures(series, blocks)
+        files = write_figures(series)
     job.stop.check()
     learning = []
     if analysis.study.learning_pages:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import textwrap
 from collections.abc import Iterable, Sequence
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
@@ -19,22 +21,24 @@ if TYPE_CHECKING:
     from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 
 APART = "   "  # between the figures of a result
+LINE = 100  # columns of text in a file or a pipe
+LONGEST_LABEL = 12  # columns of a first word, with the spaces behind it, that a line hangs from
 
 
 class TextConsole(Console):
     """A console that shows control characters in a text instead of obeying them.
 
-    Labels, titles and names come from files, so Rich's markup in them is plain text, too. Strings
-    are never broken in a file or a pipe, so that `grep` finds them.
+    Labels, titles and names come from files, so Rich's markup in them is plain text, too.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print as Rich does, but break no line in a file or a pipe."""
+        """Print as Rich does, but in a file or a pipe as `wrapped`."""
         if not self.is_terminal and all(isinstance(item, str) for item in objects):
-            options.setdefault("soft_wrap", True)
+            options["soft_wrap"] = True
+            objects = tuple(map(wrapped, objects))
         options["markup"] = False
         super().print(*objects, **options)
 
@@ -61,8 +65,21 @@ def table_console() -> Console:
     return console if console.is_terminal else TextConsole(width=get_terminal_size().columns)
 
 
+def wrapped(text: str, width: int = LINE) -> str:
+    """A text with long lines broken between words, and hung behind a label; a path stays whole."""
+    lines = text.split("\n")
+    for place, line in enumerate(lines):
+        if len(line) > width:
+            label = re.match(r" *\S+ {2,}", line)
+            hang = len(line) - len(line.lstrip()) + 2
+            hang = label.end() if label and label.end() <= LONGEST_LABEL else hang
+            whole: Any = {"break_long_words": False, "break_on_hyphens": False}
+            lines[place] = textwrap.fill(line, width, subsequent_indent=" " * hang, **whole)
+    return "\n".join(lines)
+
+
 def say(console: Console, line: str, style: str | None = None) -> None:
-    """Print a line without breaking it, however long."""
+    """Print a line, which a terminal may break anywhere: commands and paths are copied whole."""
     console.print(line, style=style, soft_wrap=True)
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +30,8 @@ if TYPE_CHECKING:
     from rl_yardstick.pipeline.training import Training
 
 RESUMED = "this run, or the newest unfinished one of --algo and --env"
+PAGE = "learning.html"
+WATCH = f"write a page that plays the training ({PAGE} in the run folder)"
 WATCHED = whole_number(1, besides={0: "the steps in which its policy improves"})
 # Flags that may stand beside --resume: none of the training itself.
 _BESIDE_RESUME = {"resume", "log_folder", "gym_packages", "verbose", "progress"}
@@ -47,7 +48,7 @@ FLAGS: Flags = {
     "": (
         flag("--algo", "agent (default: ppo; see --list)", default="ppo"),
         flag("--env", "environment id (default: CartPole-v1; see --list)", default="CartPole-v1"),
-        switch("--list", "list agents and environments, and which fit which"),
+        switch("--list", "list agents and environments that fit each other; --env: for this one"),
     ),
     "budget and settings": (
         flag("-n --n-timesteps", "environment steps", cli.BUDGET, -1),
@@ -73,7 +74,7 @@ FLAGS: Flags = {
         flag("--verbose", "0 silent, 1 (default), 2 the library's tables", whole_number(0, 2), 1),
         switch("-P --progress", "a progress bar even without a terminal"),
         *shared("--diagnose"),
-        flag("--watch-learning", "write a page (.html) that plays the training", metavar="FILE"),
+        flag("--watch-learning", WATCH, nargs="?", const="", metavar="FILE"),
         flag("--watch-episodes", "first episodes of a table to play on it", WATCHED, 0),
     ),
     "resuming": (
@@ -91,12 +92,17 @@ def build_parser() -> OneLineParser:
 
 def main() -> int:
     """Train, resume or list."""
-    args = build_parser().parse_args()
+    parser = build_parser()
+    args = parser.parse_args()
     cli.import_typed(args)
+    from rl_yardstick.commands.terminal import TextConsole, table_console
+
     if args.list:
-        print_lists()
+        from rl_yardstick.report.catalogue import print_lists
+
+        is_for_one = any(word.partition("=")[0] == "--env" for word in parser.typed)
+        print_lists(table_console(), args.env if is_for_one else "")
         return 0
-    from rl_yardstick.commands.terminal import TextConsole
     from rl_yardstick.pipeline.run import Run, Stop
 
     stop = Stop().listen()
@@ -125,11 +131,11 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
             outcome = train(spec, run, resumes, print_engine)
         except Stopped:
             if run.has_begun:
-                again = f"{cli.called_as('train')} --resume {run.path}"
+                again = cli.to_copy("train", "--resume", run.path)
                 run.console.print(f"stopped; resume with: {again}")
             raise
         if not run.console.quiet:
-            print_outcome(run.console, spec, run, outcome)
+            print_outcome(run, spec, outcome, args)
     return 0
 
 
@@ -165,7 +171,7 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
         trained_agent=whole_zip(Path(args.trained_agent)) if args.trained_agent else None,
         tensorboard_log=args.tensorboard_log or None,
         library_log=args.verbose > 1,
-        watch_learning=page_path(args) if args.watch_learning or args.watch_episodes else None,
+        watch_learning=_page(args),
         map_name=map_name(args.env, entry),
         origins=origins,
         **{name: getattr(args, name) for name in names},
@@ -215,10 +221,12 @@ def whole_zip(path: Path) -> str:
     return str(path.absolute())
 
 
-def page_path(args: argparse.Namespace) -> str:
-    """The absolute path of the page of ``--watch-learning``, which can be written."""
-    if args.watch_learning is None:
-        raise UserError("--watch-episodes needs --watch-learning FILE")
+def _page(args: argparse.Namespace) -> str | None:
+    """The path of the page of ``--watch-learning``: a name in the run folder, or absolute."""
+    if args.watch_learning is None and args.watch_episodes:
+        raise UserError("--watch-episodes needs --watch-learning")
+    if not args.watch_learning:
+        return None if args.watch_learning is None else PAGE
     path = Path(args.watch_learning)
     if path.suffix != ".html" or path.is_dir():
         raise UserError(f"--watch-learning writes a .html file, not {path.name!r}")
@@ -305,49 +313,51 @@ def print_engine(parts: Training) -> None:
         parts.run.console.print(f"engine   {plan}{other}", style="dim", soft_wrap=True)
 
 
-def print_outcome(console: Console, spec: TrainSpec, run: Run, outcome: Training) -> None:
+def print_outcome(run: Run, spec: TrainSpec, outcome: Training, args: argparse.Namespace) -> None:
     """Print what was done, below it the result, and the commands to type next."""
-    from rl_yardstick.commands.terminal import result_lines, say
+    from rl_yardstick.commands.terminal import describe_others, result_lines, say
 
+    console = run.console
     for label, text in rows_of(run, outcome):
         say(console, f"{label:<9}{text}")
     results = [] if outcome.pulled is None else [describe_pulls(outcome.pulled)]
-    results += [] if outcome.final is None else result_lines(outcome.final)
+    if (final := outcome.final) is not None:
+        others = describe_others(final.others) if final.others else []
+        results += [*result_lines(final), *(f"also     {line}" for line in others)]
     say(console, "\n".join(["", *results]) if results else "")
     exact = outcome.judge.exact
-    if exact and outcome.final and (told := exact.instead(outcome.agent, outcome.final)):
+    if exact and final and (told := exact.instead(outcome.agent, final)):
         say(console, f"instead  {told}\nmore     docs/explain.md")
-    say(console, "\n".join(["", *next_commands(run, spec.gym_packages, outcome)]))
+    say(console, "\n".join(["", *next_commands(run, spec, outcome.can_be_explained, args)]))
     if outcome.watch is not None and spec.watch_learning is not None:
         from rl_yardstick.report.page.learning import write_learning_page
 
+        page = run.path.absolute() / spec.watch_learning  # or where FILE is
         with console.status("writing the page that plays the training"):
-            words = write_learning_page(spec, outcome.watch, Path(spec.watch_learning))
-        say(console, f"learning {spec.watch_learning}: {words}")
+            words = write_learning_page(spec, outcome.watch, page)
+        say(console, f"learning {words}: {page.as_uri()}")
 
 
 def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
     """What was done: labels and figures."""
-    from rl_yardstick.commands.terminal import APART, describe_others, judged
+    from rl_yardstick.commands.terminal import APART, judged
 
     taken, final = outcome.progress.taken.cpu_seconds, outcome.final
     n_steps, evaluation = outcome.agent.num_timesteps, outcome.evaluation
     speed = f"{n_steps / max(taken, 1e-9):,.0f} steps/s"
     text = f"{n_steps:,} steps in {taken:.1f} s of processor time ({speed})"
     rows = [("trained", text)]
-    if outcome.engine:
+    if outcome.engine and not hasattr(outcome.agent, "engine_plan"):  # told before the training
         rows.append(("engine", outcome.engine))
-    if final is not None and final.others is not None:
-        rows += [("beside", line) for line in describe_others(final.others)]
     if evaluation.best is not None:
         yardstick = None if final is None else final.yardstick
         best = judged(evaluation.best, yardstick, evaluation.best_episodes)
         rows.append(("best", APART.join([*best, f"at step {evaluation.best_timesteps:,}"])))
     if final is not None:
         share = outcome.evaluation_steps / max(n_steps, 1)
-        played = f"{outcome.evaluation_steps:,} steps beside training ({share:.0%} of it)"
-        how = played if outcome.evaluation_steps else "exact, no episodes sampled"
-        rows.append(("tests", f"{how}; {evaluation.taken.cpu_seconds:.1f} s of processor time"))
+        played = f"on {outcome.evaluation_steps:,} steps beside training ({share:.0%} of it)"
+        how = played if outcome.evaluation_steps else "exactly, no episodes sampled"
+        rows.append(("tested", f"{how}; {evaluation.taken.cpu_seconds:.1f} s of processor time"))
     return [*rows, ("files", str(run.path))]
 
 
@@ -357,8 +367,7 @@ def describe_pulls(pulls: PullSummary) -> str:
     from rl_yardstick.pipeline.run import LAST_PULLS
 
     if pulls.regret is not None and pulls.optimal is not None:
-        last = min(LAST_PULLS, pulls.n_pulls)
-        best = f"best arm in {percent(pulls.optimal)} of the last {last}"
+        best = f"best arm in {percent(pulls.optimal)} of the last {min(LAST_PULLS, pulls.n_pulls)}"
         return f"regret {pulls.regret:,.2f} over {pulls.n_pulls:,} pulls{APART}{best}"
     if pulls.reward is None:
         return f"regret not known: none of {pulls.n_pulls:,} pulls is in the log"
@@ -366,54 +375,19 @@ def describe_pulls(pulls: PullSummary) -> str:
     return f"regret not known{APART}reward {pulls.reward:.4f} a pull over the {known}"
 
 
-def next_commands(run: Run, gym_packages: list[str], outcome: Training) -> list[str]:
+def next_commands(run: Run, spec: TrainSpec, explained: bool, args: Any) -> list[str]:
     """Commands to type next, in the working directory of the training."""
-    more = ["--gym-packages", *gym_packages] if gym_packages else []
+    from rl_yardstick.report.catalogue import rival
+
+    more = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
     labels = ("watch    ", "enjoy"), ("explain  ", "explain")
-    return [
-        f"{label}{cli.called_as(command)} {shlex.join([str(run.path), *more])}"
-        for label, command in labels[: 1 + outcome.can_be_explained]
-    ]
-
-
-# --- the lists of agents and environments ---------------------------------------------------------
-
-
-def print_lists() -> None:
-    """Print the agents, the environments with settings for some agent."""
-    import gymnasium as gym
-    from rich.table import Column, Table
-
-    from rl_yardstick.agents import ALGORITHMS, fitting_algorithms
-    from rl_yardstick.agents.registry import is_bandit
-    from rl_yardstick.commands.terminal import table_console
-    from rl_yardstick.envs.wrappers import has_masks
-    from rl_yardstick.pipeline.environments import make_env
-    from rl_yardstick.pipeline.settings import entry_names
-
-    agents: list[tuple[str, str]] = [("agent (--algo)", "what it is")]
-    for name, entry in ALGORITHMS.items():
-        missing = "" if entry.is_installed else f"  needs: {entry.install_command}"
-        agents.append((name, entry.summary + missing))
-    told = "agents with hyperparameters for it; also: those that take the default ones"
-    places: list[tuple[str, str]] = [("environment (--env)", told)]
-    tuned = {name: set(entry_names(name)) for name in ALGORITHMS}
-    own = {one.id for one in gym.registry.values() if "rl_yardstick" in str(one.entry_point)}
-    for env_id in sorted((own | set().union(*tuned.values())) & set(gym.registry)):
-        if env_id == "ReplayBandit-v0":  # its arms are those of a log
-            continue
-        with closing(make_env(env_id, {})) as env:
-            spaces = env.observation_space, env.action_space
-            fitting = fitting_algorithms(*spaces, is_bandit(env), has_masks(env))
-        with_entry = [name for name in ALGORITHMS if env_id in tuned[name]]
-        others = [name for name in fitting if name not in with_entry]
-        also = "\nalso: " + " ".join(others) if others else ""
-        places.append((env_id, " ".join(with_entry) + also))
-    console = table_console()
-    for (first, second), *rows in (agents, places):
-        table = Table(Column(first, no_wrap=True), second, box=None, padding=(0, 2, 0, 0))
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
-        console.print()
-    console.print("Any environment of Gymnasium works where the spaces fit; see --gym-packages.")
+    told = [f"{label}{cli.to_copy(name, run.path, *more)}" for label, name in labels]
+    told = told[: 1 + explained]
+    if spec.env_kwargs and not args.env_kwargs:  # of a file, or typed before the run was resumed
+        return told
+    more += ["--env-kwargs", *args.env_kwargs] if args.env_kwargs else []
+    more += ["--n-timesteps", args.n_timesteps] if args.n_timesteps > 0 else []
+    more += ["--n-episodes", args.n_episodes] if args.n_episodes > 0 else []
+    more += ["--conf-file", f"{spec.algo}:{args.conf_file}"] if args.conf_file else []
+    words = ["--env", spec.env_id, "--algos", spec.algo, rival(spec), *more]
+    return [*told, f"compare  {cli.to_copy('compare', *words)}"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import math
-import shlex
 import time
 from collections import Counter
 from dataclasses import fields, replace
@@ -212,13 +211,13 @@ def do_retest(job: Job, search: Search) -> int:
         code, outcome = retested(job, search, ranked, chosen)
         print_outcome(job.console, outcome)
         path = write_winner(search, outcome)
-        write_down(job, search, outcome)
+        write_down(job, search, outcome, to_train(search.tuning, path))
         if path is not None and outcome.winner is not None:
             print_winner(job.console, search, outcome.winner.number, path)
         return code
     if search.tuning.retest:
         say(job.console, "no re-test: no other setting came close to the shipped one")
-    write_down(job, search, None)
+    write_down(job, search, None, to_train(search.tuning, None))
     return 0 if ranked or not search.is_done else 1
 
 
@@ -245,7 +244,7 @@ def retested(
             return code, concluded(tuning, ranked, chosen, analyse(results, looks))
 
 
-def write_down(job: Job, search: Search, outcome: Outcome | None) -> None:
+def write_down(job: Job, search: Search, outcome: Outcome | None, command: str) -> None:
     """Write the record of the search, and its page."""
     from rl_yardstick.tuning.retesting import FOLDER, RECORD, write_record
 
@@ -256,7 +255,8 @@ def write_down(job: Job, search: Search, outcome: Outcome | None) -> None:
             from rl_yardstick.report.page.tuning import write_tuning_page
 
             page, retest = job.root / "report.html", f"{FOLDER}/report.html"
-            write_tuning_page(record, page, retest if (job.root / retest).exists() else "")
+            retest = retest if (job.root / retest).exists() else ""
+            write_tuning_page(record, page, retest, command)
             files.append(page)
     say(job.console, f"files: {', '.join(map(str, files))}")
 
@@ -275,8 +275,6 @@ def print_opened(job: Job, search: Search) -> None:
     say(job.console, f"{words}, in {job.root}")
     if mark := unproven_mark(search.tuning):
         say(job.console, f"scores are{mark}")
-    for name in suggestions.space.widened:
-        say(job.console, f"{name}: the search space is widened to hold the shipped value")
 
 
 def print_search(console: Console, search: Search) -> None:
@@ -312,17 +310,24 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
         say(console, f"  {each.label}: {', '.join(words)}")
     if outcome.optimism is not None:
         optimism = "optimism of the search, its best there less the same on other seeds"
-        say(console, f"{optimism}: {round(outcome.optimism, 9):+.4g}")
+        say(console, f"{optimism}: {round(outcome.optimism, 9) or 0.0:+.4g}")
     if outcome.winner is None:
         say(console, f"no winner: {outcome.reason}; they stay as they are")
 
 
+def to_train(tuning: TuningSpec, winner: Path | None) -> str:
+    """The command that trains with the winner, or with the shipped settings if nothing is typed."""
+    words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id]
+    words += ["--gym-packages", *packages] if (packages := tuning.study.gym_packages) else []
+    if path := winner or tuning.agent.conf_file:
+        words += ["--conf-file", str(path)]
+    return cli.to_copy("train", *words) if winner or not tuning.agent.settings else ""
+
+
 def print_winner(console: Console, search: Search, number: int, path: Path) -> None:
     """Print how to train with the winner, and which of its settings differ from the shipped."""
-    tuning = search.tuning
-    words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id, "--conf-file"]
-    how = f"{cli.called_as('train')} {shlex.join([*words, str(path)])}"
-    say(console, f"winner: trial {number}, in {path}: {how}")
+    how = to_train(search.tuning, path)
+    say(console, f"winner: trial {number}, in {path}; to train with it:\n  {how}")
     shipped, entry = search.suggestions.shipped, search.trials[number].user_attrs["settings"]
     for key in {**shipped, **entry}:
         before, now = (each.get(key, "left out") for each in (shipped, entry))

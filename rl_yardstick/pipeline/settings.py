@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Iterable, Mapping
 from contextlib import closing, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +155,7 @@ def seeds_tuned_on(algo: str, env_id: str, path: Path | None = None) -> tuple[ra
         raise UserError(f"{path or algo}: {TUNED_ON} {form}") from error
 
 
+@cache
 def entry_names(algo: str) -> list[str]:
     """Ids of the environments with an entry in an agent's shipped file, in the file's order."""
     path = HYPERPARAMS / f"{algo}.yml"

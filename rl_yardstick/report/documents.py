@@ -195,8 +195,7 @@ def _legend(analysis: StudyAnalysis) -> str:
             what += f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
             what = " ".join([what, *words.unproven_sentences(environments)])
     text = (
-        f"{what} ±: the standard deviation of runs. Bold: the best agents, where another is "
-        "worse."
+        f"{what} ±: the standard deviation of runs. Bold: the best agents, where another is worse."
     )
     if words.processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch, Rectangle
@@ -34,6 +33,7 @@ from rl_yardstick.report.series import (
     COLOURS,
     DASHES,
     DWARFED,
+    N_KINDS,
     SPREAD,
     ArmSeries,
     Belief,
@@ -45,7 +45,6 @@ from rl_yardstick.report.series import (
     Mark,
     PullSeries,
     StudySeries,
-    linear_up_to,
     mean_regret,
     regret_of_runs,
 )
@@ -63,12 +62,11 @@ if TYPE_CHECKING:
 _LINE_STYLES: Mapping[Dash, str] = {"solid": "-", "dash": "--", "dashdot": "-.", "dot": ":"}
 
 REFERENCE = "0.35"  # the grey of reference lines
-MOST_BANDS = 4  # the largest number of shaded intervals in a figure: more would hide each other
+MOST_BANDS = 5  # the largest number of shaded intervals in a figure: more would hide each other
 
 # Inches.
 WIDTH, HEIGHT = 6.5, 2.7  # of a row of panels
 _BESIDE, _BELOW = 0.85, 0.8  # space for tick labels and axis labels of a panel
-_END = 1.5  # width of the names beside the ends of lines
 _LINE = 0.14  # from one line of small print to the next
 
 _SMALL, _PLAIN, _TITLE = 8, 9, 9.5
@@ -86,16 +84,6 @@ FORMATS = ("png", "svg", "pdf")
 _UNDATED = {"svg": {"metadata": {"Date": None}}, "pdf": {"metadata": {"CreationDate": None}}}
 
 LOG = "(log scale)"
-
-# A name beside the end of a line, and what leads to it.
-_NAME: Any = {
-    "textcoords": "axes fraction",
-    "fontsize": _SMALL,
-    "verticalalignment": "center",
-    "linespacing": 1.1,
-    "annotation_clip": False,
-}
-_TO_A_NAME: Any = {"arrowstyle": "-", "shrinkA": 0, "shrinkB": 0, "relpos": (0, 0.5)}
 
 
 def line_style(mark: Mark) -> dict[str, Any]:
@@ -209,49 +197,6 @@ def shared_legend(*places: Axes, band: str = "") -> None:
     figure.legend([*found.values()], names, loc="outside lower center", **style)
 
 
-def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> None:
-    """Write names beside the ends of lines, after all are drawn; ``ends``: name, x, y, colour.
-
-    An arrow after a name says that its line ends above the axes.
-    """
-    low, high = axes.get_ylim()
-    names = [wrapped(f"{name} ↑" if y > high else name, _END) for name, _, y, _ in ends]
-    figure, spec = _figure_of(axes), axes.get_subplotspec()
-    n_rows = 1 if spec is None else spec.get_gridspec().nrows
-    needed = [_LINE * (name.count("\n") + 1) for name in names]
-    inches = max(figure.get_figheight() / n_rows - _BELOW, sum(needed))
-    figure.set_figheight(max(figure.get_figheight(), (inches + _BELOW) * n_rows))
-    seen = [float(np.clip(y, low, high)) for _, _, y, _ in ends]
-    heights = [(y - low) / ((high - low) or 1.0) for y in seen]
-    places = _apart(heights, [inch / inches for inch in needed])
-    for name, (_, x, _, colour), y, place in zip(names, ends, seen, places, strict=True):
-        arrow = {"color": colour, "linewidth": 0.5 if y < high else 0, **_TO_A_NAME}
-        axes.annotate(name, (x, y), (1.04, place), color=colour, arrowprops=arrow, **_NAME)
-
-
-def _apart(wanted: Sequence[float], sizes: Sequence[float]) -> list[float]:
-    """Centres in [0, 1] near the wanted ones, so that no labels of these sizes overlap."""
-
-    def bottom(group: list[int]) -> float:
-        """That of a stack of labels, near the mean of their wanted centres."""
-        total = sum(sizes[k] for k in group)
-        middle = float(np.mean([wanted[k] for k in group]))
-        return min(max(middle - total / 2, 0.0), 1 - total)
-
-    stacks: list[list[int]] = []
-    for k in np.argsort(wanted, kind="stable").tolist():
-        stack = [k]
-        while stacks and bottom(stacks[-1]) + sum(sizes[j] for j in stacks[-1]) > bottom(stack):
-            stack = stacks.pop() + stack
-        stacks.append(stack)
-    places = list(wanted)
-    for stack in stacks:
-        tops = bottom(stack) + np.cumsum([sizes[k] for k in stack])
-        for k, top in zip(stack, tops.tolist(), strict=True):
-            places[k] = top - sizes[k] / 2
-    return places
-
-
 # Figures of bandits, in the forms of the textbooks.
 
 Marks = Mapping[str, Mark]
@@ -269,11 +214,14 @@ def draw_rewards(upper: Axes, lower: Axes, series: PullSeries, place: str, marks
         style = {"color": REFERENCE, "linestyle": "-"}
         rewards.append(("best possible", pulls, np.full(2, series.best), style))
     _draw_lines(upper, rewards)
-    lettering(upper, title=f"{place}, {series.n_runs:,} runs", x="pulls", y="average reward")
+    lettering(
+        upper, title=f"{place}, {series.n_runs:,} runs", x="pulls", y="average reward per pull"
+    )
     lower.set_ylim(0, 1)
     _draw_lines(lower, _by_pull(series, "optimal", marks))
     lower.yaxis.set_major_formatter(PercentFormatter(1))
     lettering(lower, x="pulls", y="runs that pull a best arm")
+    shared_legend(upper, lower)
 
 
 def _by_pull(series: PullSeries, what: str, marks: Marks) -> list[Line]:
@@ -284,10 +232,8 @@ def _by_pull(series: PullSeries, what: str, marks: Marks) -> list[Line]:
 
 
 def _draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
-    """Lines with their names at their ends."""
     for name, x, y, style in lines:
         axes.plot(x, y, label=name, linewidth=1, **style)  # type: ignore[arg-type]
-    label_ends(axes, [(name, x[-1], y[-1], style["color"]) for name, x, y, style in lines])
 
 
 def draw_regret(places: Sequence[Axes], series: PullSeries, place: str, marks: Marks) -> None:
@@ -302,7 +248,7 @@ def draw_regret(places: Sequence[Axes], series: PullSeries, place: str, marks: M
     for each in others:
         _draw_lines(each, _by_pull(series, "simple_regret", marks))
         title = "of recommending the arm pulled most"
-        lettering(each, title=title, x=_PULLS, y="simple regret")
+        lettering(each, title=title, x=_PULLS, y="simple regret (reward per pull)")
     lines = _by_pull(series, "cumulative_regret", marks)
     # The interval of the mean and the spread of runs, or fewer bands where agents are many.
     kinds = ((mean_regret, 0.3), (regret_of_runs, 0.08))[: MOST_BANDS // len(series.pulls)]
@@ -323,7 +269,8 @@ def draw_regret(places: Sequence[Axes], series: PullSeries, place: str, marks: M
         highest = min(highest, float(bounds.auer[-1]))
     axes.set_ylim(0, 1.05 * highest)
     _draw_lines(axes, lines)
-    lettering(axes, title=title, x=_PULLS, y="cumulative regret")
+    lettering(axes, title=title, x=_PULLS, y="cumulative regret (reward)")
+    shared_legend(*places)
 
 
 def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
@@ -346,7 +293,7 @@ def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
     upper.yaxis.set_major_formatter(PercentFormatter(1))
     lettering(upper, title="pulls, by context", y="share of the pulls")
     title = "final estimates, mean and spread over runs; lines across are the truth"
-    lettering(lower, title=title, y="mean reward")
+    lettering(lower, title=title, y="mean reward per pull")
     shared_legend(upper)
 
 
@@ -356,7 +303,7 @@ def draw_belief(panels: Sequence[Axes], belief: Belief) -> None:
     for panel, axes in enumerate(panels):
         context, moment = divmod(panel, n_moments)
         for arm in range(n_arms):
-            colour = COLOURS[arm % len(COLOURS)]
+            colour = COLOURS[arm % N_KINDS]
             y = belief.densities[moment, context, arm]
             axes.plot(belief.points, y, linewidth=1.2, label=f"arm {arm}", color=colour)
             mean = belief.true_means[context][arm]
@@ -364,11 +311,11 @@ def draw_belief(panels: Sequence[Axes], belief: Belief) -> None:
                 axes.axvline(mean, color=colour, linestyle=":", linewidth=1)
         where = f", context {context}" if n_contexts > 1 else ""
         title = f"{belief.agent}{where}, after {belief.moments[moment]:,} pulls"
-        lettering(axes, title=title, x="mean reward", y="density")
-    panels[0].legend(frameon=False)
+        lettering(axes, title=title, x="mean reward per pull", y="density")
+    shared_legend(*panels)
 
 
-# Figures of any study: learning curves, runs, swept parameters, blocks of episodes, profiles.
+# Figures of any study: learning curves, runs, swept parameters, profiles.
 
 _AXES = {"step": "environment steps", "episode": "episodes"}
 
@@ -379,7 +326,6 @@ LONGEST = 20  # letters of a value on an axis
 MOST_TICKS = 8  # the largest number of values of a parameter with a tick each
 _BETWEEN = "; the optimum lies between the lines"
 FEW = 3  # the largest number of names in a legend's entry
-BLOCKS = {"average": "-", "minimum": ":", "maximum": "--"}
 
 
 def panels(curves: Mapping[str, LearningCurves]) -> list[tuple[str, str]]:
@@ -509,7 +455,7 @@ def draw_sweeps(axes: Axes, one: EnvironmentSeries, metric: str) -> None:
     best = with_best_mean(environment, *(sweep.labels for sweep in sweeps.values()))
     rings: list[list[float]] = []
     for place, (group, sweep) in enumerate(sweeps.items()):
-        mark = Mark(group, place % len(COLOURS), DASHES[place % len(DASHES)])
+        mark = Mark(group, place % N_KINDS, DASHES[place % len(DASHES)])
         x, y = sweep.means.x, sweep.means.y
         label = group if len(names) == 1 else f"{group}, {sweep.parameter}"
         axes.plot(x, y, marker="o", label=label, markersize=4, **line_style(mark))
@@ -566,17 +512,17 @@ def draw_grid(
     axes: Axes, grid: Grid, title: str, environment: EnvironmentAnalysis, metric: str
 ) -> None:
     """The means over two swept parameters as a heat map, the best in frames."""
-    shares = grid.shares(is_cost=metric in COSTS)  # the darker the better
-    colours = mpl.colormaps["Blues"](0.05 + 0.75 * shares)
+    shares = grid.shares(is_cost=metric in COSTS)  # the lighter the better
+    colours = mpl.colormaps["viridis"](0.1 + 0.85 * shares)
     across, down = (np.arange(-0.5, n) for n in grid.means.shape[::-1])  # edges of the cells
     axes.pcolormesh(across, down, colours, edgecolor="white", linewidth=1)
     best = with_best_mean(environment, *grid.labels)
     for (row, column), mean in np.ndenumerate(grid.means):
         if not np.isnan(mean):
-            ink = "white" if shares[row, column] > 0.6 else "black"
+            ink = "black" if shares[row, column] > 0.6 else "white"
             axes.text(column, row, number(mean), color=ink, ha="center", va="center", size=8)
         if grid.labels[row][column] in best:
-            frame = Rectangle((column - 0.46, row - 0.44), 0.92, 0.88, fill=False, linewidth=2)
+            frame = Rectangle((column - 0.46, row - 0.44), 0.92, 0.88, fill=False, linewidth=2.5)
             frame.set_edgecolor(COLOURS[1])
             axes.add_patch(frame)
     axes.invert_yaxis()
@@ -601,18 +547,15 @@ MOST_LINES = 14
 MOST_IN_PAIRS = 8  # the largest number of panels in two columns; more are in three
 
 
-def write_figures(series: StudySeries, episodes_table: pd.DataFrame | None) -> list[Path]:
-    """Draw all figures that the study's runs allow into its folder ``figures``; return the files.
-
-    ``episodes_table`` is the result of `report.series.episodes_table`, or None for no such figure.
-    """
+def write_figures(series: StudySeries) -> list[Path]:
+    """Draw all figures that a study's runs allow into its folder ``figures``; return the files."""
     files = FigureFiles(series.analysis.results.root / "figures", series.analysis.study.figures)
     files.folder.mkdir(exist_ok=True)
     for one in series.environments:
         if one.pulls is not None:
             _bandit_figures(files, one.pulls, one.environment.environment, series.marks)
     for one in series.environments:
-        _study_figures(files, series, one, episodes_table)
+        _study_figures(files, series, one)
     if (overall := series.analysis.overall) is not None:
         with files.figure("performance_profiles") as (axes,):
             for agent, shares in overall.profiles.items():
@@ -626,9 +569,7 @@ def write_figures(series: StudySeries, episodes_table: pd.DataFrame | None) -> l
     return files.written
 
 
-def _study_figures(
-    files: FigureFiles, series: StudySeries, one: EnvironmentSeries, blocks: pd.DataFrame | None
-) -> None:
+def _study_figures(files: FigureFiles, series: StudySeries, one: EnvironmentSeries) -> None:
     environment, metric, marks = one.environment, series.analysis.study.metric, series.marks
     name = file_name(environment.environment)
     if one.sweeps:
@@ -646,31 +587,6 @@ def _study_figures(
             draw_learning_curves(places, one, marks)
     with files.figure(f"{name}_intervals") as (axes,):
         draw_runs(axes, one, metric, marks)
-    if blocks is not None:
-        rows = blocks[blocks["environment"] == environment.environment]
-        _block_figure(files, f"{name}_episodes", rows, marks)
-
-
-def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Marks) -> None:
-    found = {str(agent): found for agent, found in rows.groupby("agent", sort=False)}
-    if not found:
-        return
-    n_columns = min(len(found), 2 if len(found) <= MOST_IN_PAIRS else 3)
-    curves = [each[column].to_numpy(float) for each in found.values() for column in BLOCKS]
-    with files.figure(name, n_columns, -(-len(found) // n_columns), height=2.2) as places:
-        for axes in places[1 : len(found)]:
-            axes.sharey(places[0])
-        for axes, (agent, blocks) in zip(places, found.items(), strict=False):
-            words = _set_scale(axes, linear_up_to(curves, None))
-            look: Any = {"marker": "o", "markersize": 3, "color": COLOURS[marks[agent].colour]}
-            for column, style in BLOCKS.items():
-                axes.plot(blocks["episode"], blocks[column], style, **look)
-            lettering(axes, title=agent, x="episode", y=f"return{words}")
-        for axes in places[len(found) :]:
-            axes.set_visible(False)
-        for label, style in BLOCKS.items():
-            places[0].plot([], [], style, marker="o", ms=3, color=REFERENCE, label=label)
-        shared_legend(places[0])
 
 
 def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Marks) -> None:

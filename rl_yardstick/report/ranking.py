@@ -27,6 +27,7 @@ class Cell:
     aside: str = ""  # its tooltip on the page
     # Low end, point and high end of a bar to draw, each between 0 and 1; or None.
     bar: tuple[float, ...] | None = None
+    estimate: Estimate | None = None  # the figure with its interval, if it has one
 
 
 def bar(score: Estimate) -> tuple[float, ...]:
@@ -42,7 +43,8 @@ def _known(value: float) -> float | None:
 def estimate_cell(estimate: Estimate, as_text: Format = number) -> Cell:
     """A figure with its interval, or with the range of few runs."""
     note, in_line = interval_alone(estimate, as_text), interval(estimate, as_text)
-    return Cell(as_text(estimate.point), _known(estimate.point), note, in_line)
+    point = estimate.point
+    return Cell(as_text(point), _known(point), note, in_line, estimate=estimate)
 
 
 def threshold_cell(stays: ThresholdSummary | None) -> Cell | None:

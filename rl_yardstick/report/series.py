@@ -31,17 +31,24 @@ from rl_yardstick.verdicts import UNBOUNDED, Bounds, Estimate
 # From this ratio on, the largest values flatten the rest of a linear axis: two decades.
 DWARFED = 100
 
-# Okabe and Ito's palette, which is safe for colour-blind readers. The page's style sheet repeats
-# it, and has another one for the dark theme.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# Colours for kinds of agents, of which colour-blind readers can tell lines and pale bands apart:
+# blue, red, green, wine, cyan, black, indigo. Behind them, from dark to light, those of viridis for
+# agents swept over a number. The page's style sheet repeats them, with others for the dark theme.
+N_KINDS, N_STEPS = 7, 8
+COLOURS = (
+    *("#0072B2", "#EE6677", "#2CA02C", "#882255", "#17BECF", "#000000", "#332288"),
+    *("#440154", "#482979", "#3D4D8A", "#2F6C8E", "#23888E", "#20A486", "#44BF70", "#86D549"),
+)
+
+LEAST_VALUES = 3  # the smallest number of values of a swept parameter for colours and a figure
 
 # Ticks of an axis of scores; where most scores are above 0.8, ticks and their places from 0 to 1.
 LINEAR = (0.0, 0.5, 1.0)
 SCORES, STRETCHED = (0.0, 0.8, 0.9, 1.0), (0.0, 0.35, 0.675, 1.0)
 
 Dash = Literal["solid", "dash", "dashdot", "dot"]
-# Seven colours and four line styles repeat together: neighbours differ in both, so lines differ in
-# greyscale, too, and 28 agents have distinct marks.
+# The colours of kinds and four line styles repeat together: neighbours differ in both, so lines
+# differ in greyscale, too, and 28 agents have distinct marks.
 DASHES: tuple[Dash, ...] = ("solid", "dash", "dashdot", "dot")
 
 
@@ -58,13 +65,35 @@ class Mark:
 
 
 def agent_marks(study: StudySpec) -> dict[str, Mark]:
-    """The marks of the agents by label, in the order of the study."""
-    marks = {}
-    for place, agent in enumerate(study.agents):
-        again, colour = divmod(place, len(COLOURS))
+    """The marks of the agents by label, in the order of the study.
+
+    An agent swept over a number gets a colour by the place of its value among the others.
+    """
+    marks: dict[str, Mark] = {}
+    for n, members in enumerate(numeric_sweeps(study.agents).values()):
+        if len(values := sorted({value for value, _ in members})) >= LEAST_VALUES:
+            for value, label in members:
+                rank = values.index(value)
+                colour = N_KINDS + round((N_STEPS - 1) * rank / (len(values) - 1))
+                marks[label] = Mark(label, colour, DASHES[(n + rank) % len(DASHES)])
+    kinds = [agent.label for agent in study.agents if agent.label not in marks]
+    for place, label in enumerate(kinds):
+        again, colour = divmod(place, N_KINDS)
         dash, shape = DASHES[place % len(DASHES)], again % len(DASHES)
-        marks[agent.label] = Mark(agent.label, colour, dash, shape)
-    return marks
+        marks[label] = Mark(label, colour, dash, shape)
+    return {agent.label: marks[agent.label] for agent in study.agents}
+
+
+def numeric_sweeps(
+    agents: Iterable[AgentSpec],
+) -> dict[tuple[str, str], list[tuple[float, str]]]:
+    """The numbers that agents are swept over, with their labels, by common label and parameter."""
+    found: dict[tuple[str, str], list[tuple[float, str]]] = {}
+    for agent in agents:
+        for name, value in agent.swept.items():
+            if len(agent.swept) == 1 and isinstance(value, int | float):
+                found.setdefault((agent.group, name), []).append((float(value), agent.label))
+    return found
 
 
 KINDS = ("evaluation", "training")
@@ -363,9 +392,6 @@ def arm_series(known: Pulls) -> ArmSeries | None:
     )
 
 
-LEAST_VALUES = 3  # the smallest number of values of a parameter for a figure
-
-
 @dataclass(frozen=True)
 class AgentRuns:
     """The metric of an agent's runs."""
@@ -419,9 +445,8 @@ def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dic
     """The means of each agent swept over one parameter, in the order of its values."""
     found: dict[str, Sweep] = {}
     means = {agent.agent: agent.metric.mean for agent in environment.agents}
-    for (group, name), members in _groups(agents, environment, 1).items():
-        numbers = [(one.swept[name], one.label) for one in members]
-        by_value = {float(x): label for x, label in numbers if isinstance(x, int | float)}
+    for (group, name), members in numeric_sweeps(a for a in agents if a.label in means).items():
+        by_value = dict(members)
         if len(by_value) >= LEAST_VALUES:
             x, labels = zip(*sorted(by_value.items()), strict=True)
             rows = [(e.point, e.low, e.high) for e in map(means.__getitem__, labels)]
@@ -433,7 +458,11 @@ def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict
     """The means of each agent swept over two parameters, by the values of both."""
     found: dict[str, Grid] = {}
     means = {agent.agent: agent.metric.mean for agent in environment.agents}
-    for (group, *names), members in _groups(agents, environment, 2).items():
+    groups: dict[tuple[str, ...], list[AgentSpec]] = {}
+    for spec in agents:
+        if len(spec.swept) == 2 and spec.label in means:
+            groups.setdefault((spec.group, *spec.swept), []).append(spec)
+    for (group, *names), members in groups.items():
         down, across = ([str(one.swept[name]) for one in members] for name in names)
         rows, columns = list(dict.fromkeys(down)), list(dict.fromkeys(across))
         at = dict(zip(zip(down, across, strict=True), (one.label for one in members), strict=True))
@@ -443,18 +472,6 @@ def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict
             parameters = symbol(names[0]), symbol(names[1])
             found[group] = Grid(parameters, rows, columns, np.array(points), labels)
     return found
-
-
-def _groups(
-    agents: Sequence[AgentSpec], environment: EnvironmentAnalysis, n_parameters: int
-) -> dict[tuple[str, ...], list[AgentSpec]]:
-    """The agents with a mean here in each sweep over ``n_parameters``, by label and parameters."""
-    groups: dict[tuple[str, ...], list[AgentSpec]] = {}
-    there = {agent.agent for agent in environment.agents}
-    for spec in agents:
-        if len(spec.swept) == n_parameters and spec.label in there:
-            groups.setdefault((spec.group, *spec.swept), []).append(spec)
-    return groups
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -16,11 +17,21 @@ from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.off_policy import difference_in_value, mean_reward
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.study import METRIC_WORDS, StudySpec
-from rl_yardstick.report.ranking import BANDIT_COLUMNS, CAPTIONS, COLUMNS, Column, Row, filled
+from rl_yardstick.report.ranking import (
+    BANDIT_COLUMNS,
+    CAPTIONS,
+    COLUMNS,
+    Cell,
+    Column,
+    Row,
+    filled,
+    number_cell,
+)
 from rl_yardstick.report.words import (
     answer,
     conclusion,
     enumeration,
+    interval,
     number,
     optimum_words,
     pairs_both_ways,
@@ -113,12 +124,39 @@ def _print_fitting(
     """Print a table with the columns that fit; return the headings of the others."""
     cells = {"agent": [row.agent.marked for row in rows]}
     for column, found in filled(columns, rows):
-        cells[column.terminal] = [cell.in_line or cell.text for cell in found]
+        cells[column.terminal] = _with_equal_decimals(found)
     order = (*FIRST_LEFT_OUT, *(column.terminal for column in columns[:0:-1]))
     table, left_out = _fitting(console, cells, order, MOST_AGENT_WIDTH)
     table.title = title
     console.print(table, crop=False)
     return left_out
+
+
+_FIGURE = re.compile(r"-?[\d,]*(?:\.(\d+))?")
+
+
+def _with_equal_decimals(cells: Sequence[Cell]) -> list[str]:
+    """The texts of a column, in which all figures have as many decimals as the longest."""
+    texts = [cell.in_line or cell.text for cell in cells]
+    found = [_FIGURE.match(text) for text in texts]
+    decimals = max(len(one[1] or "") for one in found if one)
+    fixed = partial(number, decimals=decimals)
+    for place, (cell, one) in enumerate(zip(cells, found, strict=True)):
+        if one and one[0] == number(cell.value):
+            was, now = one[0], fixed(cell.value)
+            if cell.estimate and interval(cell.estimate) in texts[place]:
+                was, now = interval(cell.estimate), interval(cell.estimate, fixed)
+            texts[place] = texts[place].replace(was, now, 1)
+        elif one and one[0] == texts[place] and decimals:  # a score, which is rounded down
+            texts[place] = f"{one[0].partition('.')[0]}.{one[1] or '':0<{decimals}}"
+    return texts
+
+
+def _aligned(texts: Sequence[str]) -> list[str]:
+    """The texts with their first figures one below the other, aligned at the decimal point."""
+    whole = [text.partition(" ")[0].partition(".")[0].rstrip("%") for text in texts]
+    most = max(map(len, whole))
+    return [" " * (most - len(one)) + text for one, text in zip(whole, texts, strict=True)]
 
 
 def _fitting(
@@ -129,7 +167,8 @@ def _fitting(
     Numbers never wrap. Names, in the first column, wrap at ``most``, and earlier where all columns
     that may be left out are. A table that still does not fit runs beyond the edge of the terminal.
     """
-    heading, *_ = cells
+    heading, *others = cells
+    cells = cells | {each: _aligned(cells[each]) for each in others}
     longest = max(map(len, [heading, *cells[heading]]))
     left_out: list[str] = []
     to_leave_out = list(dict.fromkeys(each for each in order if each in cells))
@@ -139,7 +178,7 @@ def _fitting(
         made = Table(title_justify="left")
         made.add_column(heading, no_wrap=True, width=width)
         for each in list(kept)[1:]:
-            made.add_column(each, justify="right", no_wrap=True)
+            made.add_column(each, no_wrap=True)
         for name, *row in zip(*kept.values(), strict=True):
             made.add_row(folded(name, width), *row)
         return made
@@ -187,31 +226,15 @@ def _caption(study: StudySpec, one: EnvironmentAnalysis, left_out: Sequence[str]
 
 
 def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:
-    """Print the table of `episodes_table`, with as many agents side by side as fit."""
-    for environment, rows in table.groupby("environment", sort=False):
-        title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
-        left = list(dict.fromkeys(rows["agent"]))
-        while left:
-            for n in range(len(left), 0, -1):
-                printed = _episodes(title, rows, left[:n])
-                if (needed := _width(console, printed)) <= console.width:
-                    break
-            printed.width = needed if needed > console.width else None
-            console.print()
-            console.print(printed, crop=False)
-            left = left[n:]
-
-
-def _episodes(title: str, rows: pd.DataFrame, agents: Sequence[str]) -> Table:
-    printed = Table(title=title, title_justify="left")
-    printed.add_column("episode", justify="right")
-    for agent in agents:
-        printed.add_column(folded(str(agent), MOST_AGENT_WIDTH), justify="right", no_wrap=True)
-    figures = rows.set_index(["episode", "agent"])[["average", "minimum", "maximum"]]
-    cells = {at: "  ".join(map(number, row)) for at, *row in figures.itertuples()}
-    for episode in sorted(set(rows["episode"])):
-        printed.add_row(f"{episode:,}", *(cells.get((episode, agent), "-") for agent in agents))
-    return printed
+    """Print the table of `episodes_table`, one for each agent on each environment."""
+    for (environment, agent), rows in table.groupby(["environment", "agent"], sort=False):
+        cells = {"episode": [f"{episode:,}" for episode in rows["episode"]]}
+        for heading in ("average", "minimum", "maximum"):
+            cells[heading] = _with_equal_decimals([*map(number_cell, rows[heading])])
+        printed, _ = _fitting(console, cells, ())
+        printed.title = f"{agent} on {environment}: return per {width} episodes, all seeds"
+        console.print()
+        console.print(printed, crop=False)
 
 
 def _width(console: Console, table: Table) -> int:

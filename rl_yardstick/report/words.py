@@ -30,12 +30,14 @@ if TYPE_CHECKING:
 SIGNIFICANT = 4  # digits
 
 
-def number(value: float | None) -> str:
-    """A figure with four significant digits, or a dash where there is none."""
+def number(value: float | None, decimals: int | None = None) -> str:
+    """A figure with four significant digits, or with so many decimals; a dash for none."""
     if value is None or math.isnan(value):
         return "-"
     if math.isinf(value):
         return "never" if value > 0 else "-∞"
+    if decimals is not None:
+        return f"{value:z,.{decimals}f}"
     if value == 0 or abs(value) >= 10 ** (SIGNIFICANT - 1):
         return f"{value:,.0f}"
     digits = SIGNIFICANT - 1 - math.floor(math.log10(abs(value)))
@@ -97,8 +99,9 @@ def scale_words(environment: EnvironmentAnalysis) -> str:
 
 
 def enumeration(words: Sequence[str]) -> str:
-    """Words joined by commas, the last by "and"."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 2 else words)
+    """Words joined by commas, or by semicolons if one has a comma, and the last by "and"."""
+    between = "; " if any("," in word for word in words) else ", "
+    return " and ".join([between.join(words[:-1]), words[-1]] if len(words) > 2 else words)
 
 
 def seeds(*counts: int) -> str:

@@ -150,6 +150,8 @@ class Retested:
     # Failed runs, with a score below half the best median; None if that is not defined.
     n_failed: int | None
     n_missing: int = 0
+    # How much better it is than the shipped settings, and the ends of the interval of that.
+    gain: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,7 @@ def concluded(
     if tuning.figure == STEPS:  # which the study does not compare
         scores = {SHIPPED: {label: -values for label, values in figures.items()}}
         said = judge(scores, margin=0, baseline=None, against=SHIPPED)
-    words = {name: pair.text for name, pair in _against_shipped(said).items()}
+    pairs = _against_shipped(said)
     agents = {each.agent: each for one in analysis.environments for each in one.agents}
     retested = [
         Retested(
@@ -193,7 +195,8 @@ def concluded(
             in_search=in_search.get(number),
             held_out=tuning.value(figures[label]) if len(figures[label]) else None,
             interval=mean_over_runs(figures[label]) if len(figures[label]) else None,
-            verdict=words.get(label, ""),
+            verdict=pairs[label].text if label in pairs else "",
+            gain=(pairs[label].difference, *pairs[label].interval) if label in pairs else None,
             n_runs=agents[label].n_runs if label in agents else 0,
             n_failed=agents[label].runs.failed if label in agents else None,
             n_missing=agents[label].n_missing if label in agents else 0,

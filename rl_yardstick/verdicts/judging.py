@@ -84,7 +84,8 @@ class Best:
     def __str__(self) -> str:
         words = [] if len(self.agents) < 2 else ["tied" if self.tied else "undecided"]
         words += ["so far"] if self.so_far and words != ["undecided"] else []
-        names = ", ".join(self.agents) or "none"
+        between = "; " if any("," in name for name in self.agents) else ", "
+        names = between.join(self.agents) or "none"
         return f"{names} ({' '.join(words)})" if words else names
 
 

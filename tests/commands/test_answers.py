@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from rl_yardstick.commands import COMMANDS
 from tests.pipeline.short_runs import trained
 
 ROOT = Path(__file__).parents[2]
@@ -22,7 +23,7 @@ def test_training_by_the_installed_name(type_command, tmp_path):
     assert (code, err) == (0, "")
     assert "watch    yardstick enjoy logs/qlearning/FrozenLake-v1_1\n" in out
     assert "explain  yardstick explain logs/qlearning/FrozenLake-v1_1\n" in out
-    assert max(map(len, out.splitlines())) <= 100
+    assert "compare  yardstick compare --env FrozenLake-v1 --algos qlearning sarsa" in out
     run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
     written = (run / "FrozenLake-v1" / "command.txt").read_text()
     assert written == f"yardstick train {shlex.join(words)}\n"
@@ -87,3 +88,12 @@ def test_mistakes_are_one_line(line, said, type_command, tmp_path, request):
     assert set(tmp_path.rglob("*")) == before
     assert len(err) < 1200
     assert not (out and "audit" in line)
+
+
+def test_no_line_in_a_pipe_is_too_wide(type_command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for words in [*(f"{command} --help" for command in COMMANDS), *TABLE["right"]]:
+        code, out, err = type_command("yardstick", *words.split())
+        assert code in (0, 1), err
+        for line in filter(lambda line: " " in line.strip(), out.splitlines()):
+            assert len(line) <= (80 if line[:1] in tuple("┏┃┡│└") else 100), words

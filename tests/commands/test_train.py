@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from rl_yardstick.commands.terminal import result_lines
-from rl_yardstick.commands.train import describe_pulls, next_commands
+from rl_yardstick.commands.train import build_parser, describe_pulls, next_commands
 from rl_yardstick.pipeline.callbacks import PullSummary
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
@@ -98,12 +98,23 @@ def test_how_a_run_ends():
 def test_what_to_type_next(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py"])
     run = Run(Path("else where/qlearning/FrozenLake-v1_1"))
-    explained, plain = (SimpleNamespace(can_be_explained=one) for one in (True, False))
-    assert next_commands(run, [], explained) == [
+    lake = SimpleNamespace(
+        algo="qlearning", env_id="FrozenLake-v1", env_kwargs={"is_slippery": False}
+    )
+    typed = build_parser().parse_args(
+        ["--env-kwargs", "is_slippery:False", "-n", "500", "-conf", "my.yml"]
+    )
+    told = (
+        "compare  python compare.py --env FrozenLake-v1 --algos qlearning sarsa --env-kwargs \\\n"
+    )
+    told += "    is_slippery:False --n-timesteps 500 --conf-file qlearning:my.yml"
+    assert next_commands(run, lake, True, typed) == [
         f"watch    python enjoy.py '{run.path}'",
         f"explain  python -m rl_yardstick explain '{run.path}'",
+        told,
     ]
-    (watched,) = next_commands(run, ["mine"], plain)
+    resumed = build_parser().parse_args(["--gym-packages", "mine"])  # typed with the first command
+    (watched,) = next_commands(run, lake, False, resumed)
     assert watched == f"watch    python enjoy.py '{run.path}' --gym-packages mine"
 
 
@@ -124,7 +135,8 @@ def test_a_run_with_its_page_and_a_run_from_its_model(type_command, tmp_path):
     words = ["train.py", *LAKE, "-n", "600", "--seed", "1"]
     code, out, err = type_command(*words, "--watch-learning", "page.html")
     assert (code, err) == (0, "")
-    assert "learning" in out.splitlines()[-1]
+    assert "learning step by step, steps 1 to 600 of 600" in out
+    assert (tmp_path / "page.html").as_uri() in out.splitlines()[-1]
     assert "<html" in (tmp_path / "page.html").read_text(encoding="utf-8")
     run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
     assert (run / "value_map.png").stat().st_size > 5000

@@ -139,7 +139,7 @@ def tuning():
     shipped = {"label": "shipped", "number": 0, "held_out": 0.5, "in_search": 0.6, "verdict": ""}
     shipped |= {"n_runs": 4, "n_failed": 1, "interval": interval}
     winner = {**shipped, "label": "trial 2", "number": 2, "held_out": 0.7}
-    winner["verdict"] = "better so far"
+    winner |= {"verdict": "better so far", "gain": [0.2, 0.1, 0.3]}
     retest = {"settings": [shipped, winner], "winner": "trial 2", "winner_file": "winner.yml"}
     record = {"name": "t", "command": "python tune.py <script>", "widened": ["rate"]}
     record |= {"figure": "score", "objective": "mean", "lower_is_better": False, "n_trials": 10}

@@ -4,7 +4,6 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -32,7 +31,7 @@ from rl_yardstick.report.series import (
 from tests.report import made_up
 
 GREY = "#595959"
-NAMED = {**dict(zip(COLOURS, ("blue", "orange", "green"), strict=False)), GREY: "grey"}
+NAMED = {**dict(zip(COLOURS, ("blue", "red", "green"), strict=False)), GREY: "grey"}
 THIRD = np.array([0.0, 0.5, 1.0])
 PULLS = np.array([1, 10, 100])
 BOUNDS = RegretBounds(PULLS, np.array([10.0, 30.0, 90.0]), np.array([0.0, 5.0, 10.0]))
@@ -91,10 +90,7 @@ def whole_study(root, names, label, linear_up_to=None, on_variant=()):
         EnvironmentSeries(coins, None, (), PullSeries(pulls, 75.0, BOUNDS, arms, (belief,)), {}),
     )
     found = made_up.analysis([lake, coins], names[::-1], root, overall=overall)
-    columns = ["environment", "agent", "episode", "average", "minimum", "maximum"]
-    rows = [(label, name, 5 * k, -20.0, -1000.0, 2.0 * k) for name in names for k in (1, 2)]
-    blocks = pd.DataFrame(rows, columns=columns)
-    return StudySeries(found, agent_marks(found.study), places), blocks
+    return StudySeries(found, agent_marks(found.study), places)
 
 
 @pytest.fixture
@@ -180,7 +176,7 @@ EXPECTED = Path(__file__).with_name("figures.txt").read_text(encoding="utf-8")
 
 
 def test_every_figure_of_a_study(drawn, tmp_path):
-    paths = write_figures(*whole_study(tmp_path, ["first", "second"], "lake"))
+    paths = write_figures(whole_study(tmp_path, ["first", "second"], "lake"))
     assert {path.parent for path in paths} == {tmp_path / "figures"}
     assert [path.suffix for path in paths] == [".png", ".svg"] * len(drawn)
     shown = []
@@ -194,8 +190,8 @@ LONG = "a rule of our own, number {n}, that says all of its settings in its name
 
 def test_nothing_is_cut_by_matplotlibs_own_extents(drawn, tmp_path):
     names = [("W{n:02}" * 20 if n % 2 else LONG).format(n=n) for n in range(4)]
-    paths = write_figures(*whole_study(tmp_path, names, names[0], 79.0, names[1:2]))
-    assert len(drawn) == 10
+    paths = write_figures(whole_study(tmp_path, names, names[0], 79.0, names[1:2]))
+    assert len(drawn) == 9
     for path, figure in zip(paths[::2], drawn, strict=True):
         FigureCanvasAgg(figure)  # which knows extents
         paper, inch = figure.bbox.padded(1), figure.dpi

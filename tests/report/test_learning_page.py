@@ -74,7 +74,7 @@ def test_each_agent_that_learns_is_shown_once_and_kept(do_study, tmp_path, in_th
     shown, hidden = write_first_pages(analysis, 1, Stop())
     assert (shown.agent, hidden.agent) == ("Q-learning & co", HOSTILE)
     assert (shown.seed, shown.place) == (0, "learning/Q-learning_co/FrozenLake-v1_1.html")
-    assert shown.words.startswith("step by step, 300 steps, ")
+    assert shown.words.startswith("step by step, steps 1 to 300 of 300, ")
     page = tmp_path / shown.place
     text = page.read_text(encoding="utf-8")
     assert "<h1>Q-learning &amp; co on FrozenLake-v1</h1>" in text

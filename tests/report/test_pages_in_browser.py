@@ -191,8 +191,8 @@ def test_the_page_of_a_search_draws_and_fits_a_telephone(browser, tmp_path):
     path = tmp_path / "report.html"
     write_tuning_page(made_up.tuning(), path, "retest/report.html")
     browser.load(path, 390)
-    browser.plots(3)
-    assert len(browser.all(".js-plotly-plot")) == 3
+    browser.plots(2)
+    assert len(browser.all(".js-plotly-plot")) == 2
     browser.fits(390)
     told = "a triangle at its edge is a trial beyond it. Failed: trial 4."
     assert told in browser.find("#history").text

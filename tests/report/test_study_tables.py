@@ -220,3 +220,6 @@ def test_no_digit_is_cut_and_no_column_missed_at_any_width():
                 assert rows
                 assert max(map(len, rows)) <= width
             assert "…" not in shown
+    lines = printed(lambda console: print_analysis(console, of_lake()), 120, False).splitlines()
+    shown = [[cell.find(".") for cell in line.split("│")] for line in lines if line[:1] == "│"]
+    assert shown == shown[:1] * 4

@@ -36,8 +36,8 @@ from rl_yardstick.safe_files.files import read_members
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
     """The template's variables whose words depend on the data."""
     if data["kind"] == "maps":
-        extent, stride = _count(data["n_units"], "evaluation"), data["stride"]
-        extent += f", one in {stride:,} of which is shown" if stride > 1 else ""
+        n_shown, n_units = len({*data["moments"]["number"]}), data["n_units"]
+        extent = f"{n_shown:,} of {_count(n_units, 'evaluation')}"
         return {"kind": "from evaluation to evaluation", "extent": extent, "note": ""}
     steps, note = data["steps"]["timesteps"], ""
     if data["is_cut"] and spec.watch_episodes:
@@ -45,9 +45,7 @@ def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
         note = f"a page has room for {len(steps):,} steps, and ends before the first {asked} do"
     elif data["is_longer"] and not spec.watch_episodes:
         note = "the beginning of a longer training"
-    extent = _count(len(steps), "step")
-    if data["is_longer"]:
-        extent = f"steps {steps[0]:,} to {steps[-1]:,} of {data['n_timesteps']:,}"
+    extent = f"steps {steps[0]:,} to {steps[-1]:,} of {data['n_timesteps']:,}"
     extent += f", {_count(int(np.count_nonzero(data['moves']['end'])), 'whole episode')}"
     return {"kind": "step by step", "extent": extent, "note": note}
 

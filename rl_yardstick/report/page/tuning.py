@@ -113,8 +113,6 @@ def importances(trials: Trials) -> dict[str, float]:
 
 # The share of the worst trials that the axis of values may cut off, to show the best apart.
 _BELOW = 0.25
-# The number of groups of ranks, each drawn with its own opacity.
-_GROUPS = 5
 
 
 def history(trials: Trials) -> dict[str, Any]:
@@ -157,58 +155,17 @@ def _edge(trials: Trials) -> float | None:
     return None
 
 
-def parallel(trials: Trials, shares: Mapping[str, float]) -> dict[str, Any]:
-    """Each trial as a line through its parameters, the most important ones first."""
-    ranges = trials.distributions
-    names = [*shares, *(name for name in ranges if name not in shares)]
-    is_cost = trials.record["lower_is_better"]
-    lines, ranked = [], sorted(trials.judged, key=lambda t: t["value"], reverse=is_cost)
-    for rank, trial in enumerate(ranked):
-        params = trial["params"]
-        line = {
-            "number": trial["number"],
-            "group": min(_GROUPS - 1, rank * _GROUPS // len(ranked)),
-            "text": _text(trial),
-            "at": [
-                _place(ranges[name], params[name]) if name in params else None for name in names
-            ],
-            "said": [_said(params[name]) if name in params else "not there" for name in names],
-        }
-        lines.append(line)
-    axes = [{"name": name, "ticks": _ticks(ranges[name])} for name in names]
-    return {"axes": axes, "lines": lines, "groups": _GROUPS}
-
-
-def _place(ends: BaseDistribution, value: Any) -> float:
-    """A value's position between the ends, from 0 to 1."""
-    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
-
-    if isinstance(ends, CategoricalDistribution):
-        return (ends.choices.index(value) + 0.5) / len(ends.choices)
-    assert isinstance(ends, FloatDistribution | IntDistribution)
-    low, high, at = float(ends.low), float(ends.high), float(value)
-    if ends.log:
-        low, high, at = math.log(low), math.log(high), math.log(at)
-    return 0.5 if low == high else (at - low) / (high - low)
-
-
-def _ticks(ends: Any) -> list[tuple[float, str]]:
-    values = getattr(ends, "choices", None) or (ends.low, ends.high)
-    return [(_place(ends, value), _said(value)) for value in values]
-
-
 def _said(value: Any) -> str:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return number(value) if is_number else setting(value)
 
 
 LEFT_OUT = "-"
-# The sections by template; those that are drawn are left out without data.
+# The sections by template; importances are left out without data.
 SECTIONS = (
-    *(("verdict", "What was found"), ("history", "History"), ("parallel", "Settings tried")),
-    *(("importances", "What matters"), ("cost", "Cost"), ("trials", "All trials")),
+    *(("verdict", "What was found"), ("history", "History"), ("importances", "What matters")),
+    *(("cost", "Cost"), ("trials", "All trials")),
 )
-DRAWN = ("parallel", "importances")
 
 
 def changes(trials: Trials, winner: int) -> list[tuple[str, str, str]]:
@@ -254,13 +211,16 @@ def _duration(seconds: float | None) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = "") -> None:
+def write_tuning_page(
+    record: Mapping[str, Any], path: Path, retest_page: str = "", to_train: str = ""
+) -> None:
     """Write the page of a tuning: one self-contained file, which needs no network.
 
     Args:
         record: the record of the tuning, see `tuning.retesting`.
         path: the file, which is replaced.
         retest_page: link from there to the page of the re-test; empty if there is none.
+        to_train: the command that trains with the best setting; empty if there is none.
     """
     trials = Trials(record)
     shares = importances(trials)
@@ -269,9 +229,6 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
     winner = retested.get(retest["winner"]) if retest else None
     data: dict[str, Any] = {"page": {"agents": [], "environments": []}}
     data["history"] = history(trials)
-    if trials.judged and asked:
-        lines = parallel(trials, shares)
-        data["parallel"] = {**lines, "winner": winner and winner["number"]}
     if shares:
         data["importances"] = {"names": [*shares], "shares": [*shares.values()]}
     place = asked.get("env", "an environment")
@@ -281,10 +238,11 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
         title=f"{asked.get('algo', 'an agent')} on {place}",
         record=record,
         asked=asked,
-        sections=[Section(*one) for one in SECTIONS if one[0] in data or one[0] not in DRAWN],
+        sections=[Section(*one) for one in SECTIONS if shares or one[0] != "importances"],
         retest=retest,
         retest_page=retest_page,
         winner=winner,
+        to_train=to_train,
         changes=[] if winner is None else changes(trials, winner["number"]),
         n_params=len(trials.distributions),
         cost=cost(trials),

@@ -42,7 +42,7 @@ report.section("bandits", (root, _, current) => {
   figure("pull-reward", () => true, (item) => ({
     traces: lines(item, "reward"),
     layout: layout(
-      { title: { text: "average reward" } },
+      { title: { text: "average reward per pull" } },
       { shapes: item.best === null ? [] : [ruler(item.best, "best possible")] },
     ),
   }));
@@ -71,7 +71,7 @@ report.section("bandits", (root, _, current) => {
         ...(bounds === null ? [] : theory(bounds, 1.5 * highest)),
       ],
       layout: layout({
-        title: { text: "cumulative regret" },
+        title: { text: "cumulative regret (reward)" },
         rangemode: "tozero",
         ...(highest > top && { range: [0, top] }),
       }),
@@ -82,7 +82,7 @@ report.section("bandits", (root, _, current) => {
     ({ curves }) => Object.values(curves).some((curve) => curve.simple.some((value) => value !== null)),
     (item) => ({
       traces: lines(item, "simple"),
-      layout: layout({ title: { text: "simple regret" }, rangemode: "tozero" }),
+      layout: layout({ title: { text: "simple regret (reward per pull)" }, rangemode: "tozero" }),
     }),
   );
 
@@ -133,7 +133,7 @@ report.section("bandits", (root, _, current) => {
         hovermode: "closest",
         shapes: means.map((y, i) => ({ type: "line", x0: i - 0.42, x1: i + 0.42, y0: y, y1: y, layer: "below", line: { color: report.css("--ink"), width: 1.6 } })),
         xaxis: armAxis(item),
-        yaxis: { title: { text: "mean reward" } },
+        yaxis: { title: { text: "mean reward per pull" } },
       },
     };
   });
@@ -186,7 +186,7 @@ report.section("bandits", (root, _, current) => {
         shapes: item.true_means[context].flatMap((mean, arm) =>
           mean === null ? [] : [{ type: "line", yref: "paper", y0: 0, y1: 1, x0: mean, x1: mean, line: { color: colour(arm), width: 1.4, dash: "dot" } }],
         ),
-        xaxis: { title: { text: "mean reward" }, hoverformat: ".3f" },
+        xaxis: { title: { text: "mean reward per pull" }, hoverformat: ".3f" },
         yaxis: { title: { text: "density" }, rangemode: "tozero" },
       },
     };
