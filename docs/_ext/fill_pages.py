@@ -4,8 +4,8 @@ A page requests a block by a link with a title, which a code host shows as a lin
 
     [The code](../../rl_yardstick/agents/tabular/dyna.py "code: DynaQ")
 
-The kinds of blocks: ``code``, with names that the linked file defines; ``docstring``, with the id of
-an environment; ``flags``, with the name of a command; ``reference``, with a module and optional
+The kinds of blocks: ``code``, with names that the linked file defines; ``docstring``, with the id
+of an environment; ``flags``, with the name of a command; ``reference``, with a module and optional
 names in it, for their docstrings below a heading. Tables stand in the pages themselves: see
 docs/scripts/fill_tables.py.
 """

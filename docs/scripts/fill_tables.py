@@ -3,9 +3,9 @@
     python docs/scripts/fill_tables.py            # writes the pages anew
     python docs/scripts/fill_tables.py --check    # fails where a table is not up to date
 
-A table stands between ``<!-- kind: arguments -->`` and ``<!-- end -->``. The kinds: ``facts``, with
-an environment's id and arguments, for its picture and its figures; ``optima`` and ``variants``, with
-several ids, for their optima; ``hardness``, with several ids; ``agents`` and ``agents-by-spaces``;
+A table stands between ``<!-- kind: arguments -->`` and ``<!-- end -->``. The kinds: ``facts``,
+with an environment's id and arguments, for its picture and its figures; ``optima`` and
+``variants``, with several ids, for their optima; ``hardness``, with several ids; ``agents`` and ``agents-by-spaces``;
 ``measured``, with a file of docs/measured that a benchmark has published; ``timings``, with a file
 of `benchmarks/timing.py`.
 """

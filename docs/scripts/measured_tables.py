@@ -18,11 +18,11 @@ def timings_block(name: str) -> str:
     lines = [f"| | contender | {found['unit']} | times as fast |", "|---|---|---|---|"]
     for work, contenders in found["rows"].items():
         anchor = next(iter(contenders.values()))
-        for k, (name, value) in enumerate(contenders.items()):
+        for k, (contender, value) in enumerate(contenders.items()):
             ratio = value / anchor if found["is_speed"] else anchor / value
             told = f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
             lines.append(
-                f"| {'' if k else work} | {name} | {told} | {f'{ratio:.3g}' if k else ''} |"
+                f"| {'' if k else work} | {contender} | {told} | {f'{ratio:.3g}' if k else ''} |"
             )
     rounds = "one round" if found["rounds"] == 1 else f"medians of {found['rounds']} rounds"
     lines.append(
