@@ -5,9 +5,10 @@
 
 A table stands between ``<!-- kind: arguments -->`` and ``<!-- end -->``. The kinds: ``facts``,
 with an environment's id and arguments, for its picture and its figures; ``optima`` and
-``variants``, with several ids, for their optima; ``hardness``, with several ids; ``agents`` and ``agents-by-spaces``;
-``measured``, with a file of docs/measured that a benchmark has published; ``timings``, with a file
-of `benchmarks/timing.py`.
+``variants``, with several ids, for their optima; ``hardness``, with several ids; ``agents`` and
+``agents-by-spaces``; ``measured``, with a file of docs/measured that a benchmark has published;
+``timings``, with a file of `benchmarks/timing.py`; ``output``, with a command in code marks, for
+what it prints in an empty folder, which contains times and is not checked.
 """
 
 from __future__ import annotations

@@ -115,8 +115,7 @@ FAULTS: Mapping[str, Fault] = {
         "Stable-Baselines3: BaseAlgorithm.set_random_seed; NumPy enhancement proposal 19",
     ),
     "zip-forgets-tables": Fault(
-        "The learnt values are missing from the saved file.",
-        "Stable-Baselines3: BaseAlgorithm.save",
+        "The saved file lacks the learnt values.", "Stable-Baselines3: BaseAlgorithm.save"
     ),
     "zip-forgets-optimizer": Fault(
         "The optimizer's state is not in the saved file: training continues differently.",
