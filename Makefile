@@ -89,3 +89,5 @@ $(STAMP): pyproject.toml $(PINS)
 	@$(BIN)/python -m pip install --quiet --no-deps -r requirements.txt
 	@$(BIN)/python -m pip install --quiet --no-build-isolation -c constraints.txt -e '.[dev]'
 	@touch $@
+	@[ -n "$$CI" ] || \
+	  nohup nice $(BIN)/python -m rl_yardstick.experiments.warm_up </dev/null >/dev/null 2>&1 &

@@ -12,13 +12,13 @@ import secrets
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-from numpy.lib.format import read_array
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.safe_files.files import UnsafeFileError, content_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 MAX_TEXT = 10_000_000  # bytes of a settings file
 MAX_ARRAYS = 1 << 31  # bytes of an archive of arrays
@@ -71,6 +71,8 @@ def read_arrays(
 
     ``shapes`` has the names of arrays and of their axes: those of one name have the same length.
     """
+    from numpy.lib.format import read_array
+
     from rl_yardstick.safe_files.files import read_members
 
     found: dict[str, NDArray[Any]] = {}
@@ -109,6 +111,13 @@ def replacing(path: Path) -> Iterator[Path]:
             error.filename = str(path)
         beside.unlink(missing_ok=True)
         raise
+
+
+def load_matplotlib() -> None:
+    """Load Matplotlib in half the time: without the tables of properties in its help texts."""
+    from matplotlib import artist
+
+    artist.kwdoc = lambda artist: ""
 
 
 def write_text(path: Path, text: str) -> None:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from rl_yardstick.envs.drawing import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, SHELF, WHITE, Colour
 from rl_yardstick.envs.drawing import ORANGE as AMBER
@@ -22,7 +21,7 @@ from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMap, value_map
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
-from rl_yardstick.pipeline.files import replacing
+from rl_yardstick.pipeline.files import load_matplotlib, replacing
 from rl_yardstick.safe_files.files import NO_LIMIT, content_of
 
 if TYPE_CHECKING:
@@ -38,6 +37,7 @@ def draw(folder: Path, parts: Any) -> None:
     if not spec.pictures:
         return
     with parts.run.console.status("drawing the pictures"):
+        load_matplotlib()
         if parts.pulled is None or evaluation.evaluations_timesteps:
             scale = None if parts.final is None else parts.final.yardstick
             means = [float(np.mean(row)) for row in evaluation.evaluations_results]
@@ -154,8 +154,15 @@ def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> Non
     style: Any = {"color": GREY, "markersize": 3, "markeredgewidth": 0, "label": label}
     axes.plot(steps[::stride], returns[::stride], "o", **style)
     if (width := min(MOVING_AVERAGE_EPISODES, len(returns))) > 1:
-        smooth = pd.Series(returns).rolling(width, min_periods=1).mean()[::stride]
-        axes.plot(steps[::stride], smooth, color=ORANGE, label=f"{what}, mean of {width} episodes")
+        ends, sums = np.arange(1, len(returns) + 1), np.cumsum(returns)
+        sums[width:] -= sums[:-width].copy()
+        smooth = sums / np.minimum(ends, width)
+        axes.plot(
+            steps[::stride],
+            smooth[::stride],
+            color=ORANGE,
+            label=f"{what}, mean of {width} episodes",
+        )
 
 
 # --- maps -----------------------------------------------------------------------------------------

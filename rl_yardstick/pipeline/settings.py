@@ -13,6 +13,8 @@ import re
 import sys
 from collections.abc import Iterable, Mapping
 from contextlib import closing, suppress
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +87,9 @@ def parse_yaml(text: str, where: str) -> Any:
         raise UserError(f"{where} is no valid YAML: {' '.join(str(error).split())}") from error
 
 
+_parsed = lru_cache(parse_yaml)  # a file is read for each agent, environment and trial
+
+
 def _check_names(found: Any, words: str) -> dict[str, Any]:
     """The value, which must be a mapping of names."""
     if not (isinstance(found, dict) and all(isinstance(key, str) for key in found)):
@@ -105,7 +110,8 @@ def _read_file(algo: str, path: Path | None) -> dict[str, Any] | None:
         return None
     if path.suffix == ".py":
         raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
-    return _check_names(read_yaml(path), f"{path} must map environment ids to hyperparameters")
+    entries = deepcopy(_parsed(read_text(path), str(path)))
+    return _check_names(entries, f"{path} must map environment ids to hyperparameters")
 
 
 def read_entry(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 from collections import Counter
 from collections.abc import Mapping
@@ -91,6 +92,13 @@ def importances(trials: Trials) -> dict[str, float]:
     """
     import optuna
 
+    is_new = "sklearn" not in sys.modules
+    if is_new:  # loading it takes half as long as PyTorch, and another evaluator alone needs it
+        sys.modules["sklearn"] = None  # type: ignore[assignment]
+    from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+
+    if is_new:
+        del sys.modules["sklearn"]
     ranges = trials.distributions
     judged = trials.judged
     if len({trial["value"] for trial in judged}) < 2 or not ranges:
@@ -103,11 +111,11 @@ def importances(trials: Trials) -> dict[str, float]:
         params = {name: one["params"][name] for name in drawn}
         trial = optuna.create_trial(value=one["value"], params=params, distributions=drawn)
         study.add_trial(trial)
-    evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+    evaluator = PedAnovaImportanceEvaluator()
     with warnings.catch_warnings():
         # The warning is of parameters that few trials have; the page says that itself.
         warnings.filterwarnings("ignore", "Some regimes for parameter")
-        found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+        found = get_param_importances(study, evaluator=evaluator)
     return {name: share for name, share in found.items() if share > 0}
 
 
