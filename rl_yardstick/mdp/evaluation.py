@@ -17,9 +17,16 @@ from numpy.typing import NDArray
 
 from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum, moments_by_spreading, walked
-from rl_yardstick.mdp.graph import PolicyChain, reachable_states
+from rl_yardstick.mdp.graph import PolicyChain
 from rl_yardstick.mdp.planning import action_value
-from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
+from rl_yardstick.mdp.transition_model import (
+    Bools,
+    Dynamics,
+    Floats,
+    Ints,
+    TransitionModel,
+    reachable_states,
+)
 
 
 @dataclass(frozen=True)

@@ -362,18 +362,15 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
         raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
     suggestions.check(root)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    name, direction = tuning.study.name, "minimize" if tuning.is_cost else "maximize"
     with storage_errors(root):
         _check_own(root)
-        file = open_storage(root)
-        there = optuna.create_study(
-            storage=file, study_name=name, direction=direction, load_if_exists=True
-        )
-        study = optuna.load_study(
-            study_name=name,
-            storage=Mirror(file, there._study_id),
+        study = optuna.create_study(
+            study_name=tuning.study.name,
+            storage=open_storage(root),
             sampler=SeededSampler(tuning),
             pruner=optuna.pruners.NopPruner(),  # `is_hopeless` decides
+            direction="minimize" if tuning.is_cost else "maximize",
+            load_if_exists=True,
         )
     ranges = suggestions.space.distributions
     as_json = {name: distribution_to_json(kind) for name, kind in ranges.items()}
@@ -388,38 +385,35 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         # Its process is gone, since this one holds the folder: Optuna hands the trial out again.
         study._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
-    return Search(tuning, root, study, suggestions)
+    storage, options = Mirror(study), {"sampler": study.sampler, "pruner": study.pruner}
+    in_memory = optuna.load_study(study_name=study.study_name, storage=storage, **options)
+    return Search(tuning, root, in_memory, suggestions)
 
 
 class Mirror(InMemoryStorage):
-    """The trials of a study in a file, in memory; changes are made in both.
+    """The trials of a study in memory, where they are read; changes are also made in its file.
 
-    This process alone writes the file. Reading it for each suggestion takes longer than runs do.
+    This process alone writes there. Reading the file for each suggestion takes longer than a run.
     """
 
-    def __init__(self, file: BaseStorage, study: int) -> None:
+    def __init__(self, study: Study) -> None:
         super().__init__()
-        self._file, self._in_file, self._ids = file, study, list[int]()
-        name = file.get_study_name_from_id(study)
-        own = super().create_new_study(file.get_study_directions(study), name)
-        for key, value in file.get_study_user_attrs(study).items():
-            super().set_study_user_attr(own, key, value)
-        for trial in file.get_all_trials(study):
-            self._ids.append(trial._trial_id)
-            super().create_new_trial(own, trial)
-
-    def set_study_user_attr(self, study_id: int, key: str, value: Any) -> None:
-        self._file.set_study_user_attr(self._in_file, key, value)
-        super().set_study_user_attr(study_id, key, value)
+        self.file, self.in_file, self.ids = study._storage, study._study_id, list[int]()
+        super().create_new_study(study.directions, study.study_name)
+        for key, value in study.user_attrs.items():
+            super().set_study_user_attr(0, key, value)
+        for trial in study.get_trials():
+            self.ids.append(trial._trial_id)
+            super().create_new_trial(0, trial)
 
     def create_new_trial(self, study_id: int, template_trial: FrozenTrial | None = None) -> int:
-        self._ids.append(self._file.create_new_trial(self._in_file, template_trial))
+        self.ids.append(self.file.create_new_trial(self.in_file, template_trial))
         return super().create_new_trial(study_id, template_trial)
 
 
 def _in_both(change: str) -> Callable[..., Any]:
     def made(self: Mirror, trial_id: int, *args: Any, **kwargs: Any) -> Any:
-        getattr(self._file, change)(self._ids[trial_id], *args, **kwargs)
+        getattr(self.file, change)(self.ids[trial_id], *args, **kwargs)
         return getattr(InMemoryStorage, change)(self, trial_id, *args, **kwargs)
 
     return made

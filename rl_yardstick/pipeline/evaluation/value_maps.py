@@ -15,8 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rl_yardstick.envs.layout import GridLayout
 from rl_yardstick.mdp.evaluation import actions_used
-from rl_yardstick.mdp.graph import reachable_states
-from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
+from rl_yardstick.mdp.transition_model import Bools, Floats, Ints, reachable_states
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.files import replacing
 

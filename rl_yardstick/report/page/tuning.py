@@ -92,13 +92,14 @@ def importances(trials: Trials) -> dict[str, float]:
     """
     import optuna
 
-    is_new = "sklearn" not in sys.modules
-    if is_new:  # loading it takes half as long as PyTorch, and another evaluator alone needs it
-        sys.modules["sklearn"] = None  # type: ignore[assignment]
+    known: Any = sys.modules
+    is_new = (
+        known.setdefault("sklearn", None) is None
+    )  # another evaluator needs it; it loads slowly
     from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
     if is_new:
-        del sys.modules["sklearn"]
+        del known["sklearn"]
     ranges = trials.distributions
     judged = trials.judged
     if len({trial["value"] for trial in judged}) < 2 or not ranges:
