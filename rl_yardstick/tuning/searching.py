@@ -385,8 +385,12 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         # Its process is gone, since this one holds the folder: Optuna hands the trial out again.
         study._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
-    storage, options = Mirror(study), {"sampler": study.sampler, "pruner": study.pruner}
-    in_memory = optuna.load_study(study_name=study.study_name, storage=storage, **options)
+    in_memory = optuna.load_study(
+        study_name=study.study_name,
+        storage=Mirror(study),
+        sampler=study.sampler,
+        pruner=study.pruner,
+    )
     return Search(tuning, root, in_memory, suggestions)
 
 
