@@ -342,14 +342,15 @@ def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
 
 def _draw(job: Job, analysis: StudyAnalysis, blocks: pd.DataFrame | None) -> list[Path]:
     """Draw the figures and write the page; return the files."""
-    from rl_yardstick.pipeline.files import load_matplotlib
+    from matplotlib import artist
+
     from rl_yardstick.report.page import write_report
     from rl_yardstick.report.page.frame import Report
     from rl_yardstick.report.series import study_series
 
     root = analysis.results.root
     with job.console.status("drawing the figures"):
-        load_matplotlib()
+        artist.kwdoc = lambda artist: ""  # half of Matplotlib's loading makes its help texts
         from rl_yardstick.report.figures import write_figures
 
         series = study_series(analysis)

@@ -13,14 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl_yardstick.machine_code.compiling import compiled
-from rl_yardstick.mdp.transition_model import (
-    AnyInts,
-    Bools,
-    Floats,
-    Ints,
-    TransitionModel,
-    reachable_states,
-)
+from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
 
 def steps_to_end(model: TransitionModel, allowed: Bools, target: Bools) -> tuple[Ints, Ints]:
@@ -141,7 +134,7 @@ class PolicyChain:
         ``states``, bool of shape (S,), must be closed under the policy.
         """
         if states is None:
-            states = reachable_states(model, policy > 0)
+            states = model.reached_by(policy > 0)
         listed = np.flatnonzero(states)
         place = np.cumsum(states) - 1
         weight = (policy[listed][:, :, None] * model.prob[listed]).ravel()

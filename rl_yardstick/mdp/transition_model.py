@@ -163,7 +163,18 @@ class TransitionModel:
         These are the possible starting states and all states that transitions reach from them
         without ending the episode. The rows of all other states are meaningless.
         """
-        return _read_only(reachable_states(self, np.ones(self.prob.shape[:2], np.bool_)))
+        return _read_only(self.reached_by(np.ones(self.prob.shape[:2], np.bool_)))
+
+    def reached_by(self, allowed: Bools) -> Bools:
+        """The states that ``allowed`` actions, bool of shape (S, A), visit; bool of shape (S,)."""
+        leads = (self.prob > 0) & ~self.terminated & allowed[:, :, None]
+        found = self.initial > 0
+        new = np.flatnonzero(found)
+        while len(new):
+            reached = self.next_state[new][leads[new]]
+            new = np.unique(reached[~found[reached]])
+            found[new] = True
+        return found
 
     def allowed_actions(self, mask: Bools | None = None) -> Bools:
         """The actions that planning may take, bool of shape (S, A); none in unreachable states.
@@ -229,18 +240,6 @@ def _row(P: Mapping[int, Mapping[int, Outcomes]], state: int, action: int) -> Ou
             found = f"an outcome is {form}, not {reprlib.repr(outcome)}"
             raise ValueError(f"state {state}, action {action}: {found}")
     return P[state][action]
-
-
-def reachable_states(model: TransitionModel, allowed: Bools) -> Bools:
-    """The states that are visited, with positive probability, by allowed actions."""
-    leads = (model.prob > 0) & ~model.terminated & allowed[:, :, None]
-    found = model.initial > 0
-    new = np.flatnonzero(found)
-    while len(new):
-        reached = model.next_state[new][leads[new]]
-        new = np.unique(reached[~found[reached]])
-        found[new] = True
-    return found
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:

@@ -113,13 +113,6 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
-def load_matplotlib() -> None:
-    """Load Matplotlib in half the time: without the tables of properties in its help texts."""
-    from matplotlib import artist
-
-    artist.kwdoc = lambda artist: ""
-
-
 def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all, with the same bytes on every system."""
     with replacing(path) as beside:

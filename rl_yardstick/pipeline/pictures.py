@@ -21,7 +21,7 @@ from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMap, value_map
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
-from rl_yardstick.pipeline.files import load_matplotlib, replacing
+from rl_yardstick.pipeline.files import replacing
 from rl_yardstick.safe_files.files import NO_LIMIT, content_of
 
 if TYPE_CHECKING:
@@ -36,8 +36,10 @@ def draw(folder: Path, parts: Any) -> None:
     spec, evaluation, agent = parts.spec, parts.evaluation, parts.agent
     if not spec.pictures:
         return
+    from matplotlib import artist
+
     with parts.run.console.status("drawing the pictures"):
-        load_matplotlib()
+        artist.kwdoc = lambda artist: ""  # half of Matplotlib's loading makes its help texts
         if parts.pulled is None or evaluation.evaluations_timesteps:
             scale = None if parts.final is None else parts.final.yardstick
             means = [float(np.mean(row)) for row in evaluation.evaluations_results]

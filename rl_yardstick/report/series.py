@@ -234,11 +234,9 @@ def best_of_normals(n: int) -> float:
     from scipy.integrate import quad
 
     def weighted(x: float) -> Any:
-        density = np.exp(-(x**2) / 2.0) / np.sqrt(2 * np.pi)
-        return x * n * density * special.ndtr(x) ** (n - 1)
+        return x * n * (np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)) * special.ndtr(x) ** (n - 1)
 
-    value, _ = quad(weighted, -np.inf, np.inf)
-    return float(value)
+    return float(quad(weighted, -np.inf, np.inf)[0])
 
 
 def best_expected_reward(env: gym.Env[object, object]) -> float | None:

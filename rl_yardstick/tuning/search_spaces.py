@@ -495,10 +495,7 @@ def _check(entries: Mapping[str, Dimension], where: str) -> None:
 
 @cache
 def _defaults(algo: str) -> Mapping[str, Any]:
-    """The default values of an agent's settings, as far as there are defaults.
-
-    Known agents are imported in a worker, so that this process need not load PyTorch.
-    """
+    """The default values of an agent's settings, read by a worker, which has loaded PyTorch."""
     package = ALGORITHMS[algo].entry_point.partition(":")[0].partition(".")[0]
     is_known = package in PACKAGES and "torch" not in sys.modules
     return do_aside(_read_defaults, algo) if is_known else _read_defaults(algo)

@@ -385,20 +385,12 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         # Its process is gone, since this one holds the folder: Optuna hands the trial out again.
         study._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
-    in_memory = optuna.load_study(
-        study_name=study.study_name,
-        storage=Mirror(study),
-        sampler=study.sampler,
-        pruner=study.pruner,
-    )
-    return Search(tuning, root, in_memory, suggestions)
+    study._storage, study._study_id = Mirror(study), 0
+    return Search(tuning, root, study, suggestions)
 
 
 class Mirror(InMemoryStorage):
-    """The trials of a study in memory, where they are read; changes are also made in its file.
-
-    This process alone writes there. Reading the file for each suggestion takes longer than a run.
-    """
+    """Trials that are read from memory, and written to a file too, whose reading takes longer."""
 
     def __init__(self, study: Study) -> None:
         super().__init__()
