@@ -344,15 +344,14 @@ def _draw(job: Job, analysis: StudyAnalysis, blocks: pd.DataFrame | None) -> lis
     """Draw the figures and write the page; return the files."""
     from matplotlib import artist
 
+    artist.kwdoc = lambda artist: ""  # half of Matplotlib's loading makes its help texts
+    from rl_yardstick.report.figures import write_figures
     from rl_yardstick.report.page import write_report
     from rl_yardstick.report.page.frame import Report
     from rl_yardstick.report.series import study_series
 
     root = analysis.results.root
     with job.console.status("drawing the figures"):
-        artist.kwdoc = lambda artist: ""  # half of Matplotlib's loading makes its help texts
-        from rl_yardstick.report.figures import write_figures
-
         series = study_series(analysis)
         files = write_figures(series, blocks)
     job.stop.check()

@@ -168,9 +168,8 @@ def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
     The interval is valid for many terms without dominating ones: check the effective sample size.
     It does not cover the bias of an estimator.
     """
-    mean = float(terms.mean())
-    n, tail = len(terms), (1 - confidence) / 2
-    reach = -float(special.stdtrit(n - 1, tail) * (terms.std(ddof=1) / n**0.5))
+    n, mean = len(terms), float(terms.mean())
+    reach = -float(special.stdtrit(n - 1, (1 - confidence) / 2) * (terms.std(ddof=1) / n**0.5))
     return Estimate(mean, mean - reach, mean + reach, n)
 
 

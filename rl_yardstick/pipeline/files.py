@@ -12,13 +12,10 @@ import secrets
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.safe_files.files import UnsafeFileError, content_of
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MAX_TEXT = 10_000_000  # bytes of a settings file
 MAX_ARRAYS = 1 << 31  # bytes of an archive of arrays
@@ -66,7 +63,7 @@ def read_json(path: Path, limit: int = MAX_TEXT) -> Any:
 
 def read_arrays(
     path: Path, shapes: Mapping[str, str], optional: Collection[str] = ()
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Any]:
     """Arrays of numbers in a NumPy archive, which is read as data; the ``optional`` may be missing.
 
     ``shapes`` has the names of arrays and of their axes: those of one name have the same length.
@@ -75,7 +72,7 @@ def read_arrays(
 
     from rl_yardstick.safe_files.files import read_members
 
-    found: dict[str, NDArray[Any]] = {}
+    found: dict[str, Any] = {}
     lengths: dict[str, int] = {}
     try:
         members = read_members(read_bytes(path, MAX_ARRAYS))

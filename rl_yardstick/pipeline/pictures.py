@@ -158,13 +158,8 @@ def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> Non
     if (width := min(MOVING_AVERAGE_EPISODES, len(returns))) > 1:
         ends, sums = np.arange(1, len(returns) + 1), np.cumsum(returns)
         sums[width:] -= sums[:-width].copy()
-        smooth = sums / np.minimum(ends, width)
-        axes.plot(
-            steps[::stride],
-            smooth[::stride],
-            color=ORANGE,
-            label=f"{what}, mean of {width} episodes",
-        )
+        smooth = (sums / np.minimum(ends, width))[::stride]
+        axes.plot(steps[::stride], smooth, color=ORANGE, label=f"{what}, mean of {width} episodes")
 
 
 # --- maps -----------------------------------------------------------------------------------------

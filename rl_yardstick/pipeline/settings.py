@@ -76,18 +76,16 @@ _Loader.add_constructor(
 
 def read_yaml(path: Path) -> Any:
     """The plain values in a YAML file; UserError if it cannot be read, or asks for objects."""
-    return parse_yaml(read_text(path), str(path))
+    return deepcopy(parse_yaml(read_text(path), str(path)))
 
 
+@lru_cache  # a file is read for each agent, environment and trial
 def parse_yaml(text: str, where: str) -> Any:
     """The plain values that a text in YAML spells."""
     try:
         return yaml.load(text, Loader=_Loader)  # noqa: S506  # a safe loader
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{where} is no valid YAML: {' '.join(str(error).split())}") from error
-
-
-_parsed = lru_cache(parse_yaml)  # a file is read for each agent, environment and trial
 
 
 def _check_names(found: Any, words: str) -> dict[str, Any]:
@@ -110,8 +108,7 @@ def _read_file(algo: str, path: Path | None) -> dict[str, Any] | None:
         return None
     if path.suffix == ".py":
         raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
-    entries = deepcopy(_parsed(read_text(path), str(path)))
-    return _check_names(entries, f"{path} must map environment ids to hyperparameters")
+    return _check_names(read_yaml(path), f"{path} must map environment ids to hyperparameters")
 
 
 def read_entry(
@@ -192,7 +189,7 @@ def literal(text: str) -> Any:
         return _literal(ast.parse(text.strip(), mode="eval").body)
     if text.strip().startswith(("[", "{")):  # YAML has more literals, such as {a: 1}
         with suppress(UserError):
-            return parse_yaml(text, text)
+            return deepcopy(parse_yaml(text, text))
     return text
 
 

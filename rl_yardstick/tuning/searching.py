@@ -406,17 +406,16 @@ class Mirror(InMemoryStorage):
         self.ids.append(self.file.create_new_trial(self.in_file, template_trial))
         return super().create_new_trial(study_id, template_trial)
 
+    def __getattribute__(self, name: str) -> Any:
+        found = super().__getattribute__(name)
+        if not name.startswith("set_trial_"):
+            return found
 
-def _in_both(change: str) -> Callable[..., Any]:
-    def made(self: Mirror, trial_id: int, *args: Any, **kwargs: Any) -> Any:
-        getattr(self.file, change)(self.ids[trial_id], *args, **kwargs)
-        return getattr(InMemoryStorage, change)(self, trial_id, *args, **kwargs)
+        def in_both(trial_id: int, *args: Any, **kwargs: Any) -> Any:
+            getattr(self.file, name)(self.ids[trial_id], *args, **kwargs)
+            return found(trial_id, *args, **kwargs)
 
-    return made
-
-
-for _what in ("param", "state_values", "intermediate_value", "user_attr", "system_attr"):
-    setattr(Mirror, f"set_trial_{_what}", _in_both(f"set_trial_{_what}"))
+        return in_both
 
 
 def open_storage(root: Path) -> BaseStorage:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import warnings
 from collections import Counter
 from collections.abc import Mapping
@@ -92,14 +91,6 @@ def importances(trials: Trials) -> dict[str, float]:
     """
     import optuna
 
-    known: Any = sys.modules
-    is_new = (
-        known.setdefault("sklearn", None) is None
-    )  # another evaluator needs it; it loads slowly
-    from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
-
-    if is_new:
-        del known["sklearn"]
     ranges = trials.distributions
     judged = trials.judged
     if len({trial["value"] for trial in judged}) < 2 or not ranges:
@@ -112,11 +103,11 @@ def importances(trials: Trials) -> dict[str, float]:
         params = {name: one["params"][name] for name in drawn}
         trial = optuna.create_trial(value=one["value"], params=params, distributions=drawn)
         study.add_trial(trial)
-    evaluator = PedAnovaImportanceEvaluator()
+    evaluator = optuna.importance.PedAnovaImportanceEvaluator()
     with warnings.catch_warnings():
         # The warning is of parameters that few trials have; the page says that itself.
         warnings.filterwarnings("ignore", "Some regimes for parameter")
-        found = get_param_importances(study, evaluator=evaluator)
+        found = optuna.importance.get_param_importances(study, evaluator=evaluator)
     return {name: share for name, share in found.items() if share > 0}
 
 
