@@ -24,7 +24,7 @@ import optuna
 from optuna import Study, Trial
 from optuna.distributions import distribution_to_json
 from optuna.exceptions import StorageInternalError
-from optuna.storages import BaseStorage, InMemoryStorage, RDBStorage
+from optuna.storages import BaseStorage, RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.pool import NullPool
@@ -385,37 +385,7 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         # Its process is gone, since this one holds the folder: Optuna hands the trial out again.
         study._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
-    study._storage, study._study_id = Mirror(study), 0
     return Search(tuning, root, study, suggestions)
-
-
-class Mirror(InMemoryStorage):
-    """Trials that are read from memory, and written to a file too, whose reading takes longer."""
-
-    def __init__(self, study: Study) -> None:
-        super().__init__()
-        self.file, self.in_file, self.ids = study._storage, study._study_id, list[int]()
-        super().create_new_study(study.directions, study.study_name)
-        for key, value in study.user_attrs.items():
-            super().set_study_user_attr(0, key, value)
-        for trial in study.get_trials():
-            self.ids.append(trial._trial_id)
-            super().create_new_trial(0, trial)
-
-    def create_new_trial(self, study_id: int, template_trial: FrozenTrial | None = None) -> int:
-        self.ids.append(self.file.create_new_trial(self.in_file, template_trial))
-        return super().create_new_trial(study_id, template_trial)
-
-    def __getattribute__(self, name: str) -> Any:
-        found = super().__getattribute__(name)
-        if not name.startswith("set_trial_"):
-            return found
-
-        def in_both(trial_id: int, *args: Any, **kwargs: Any) -> Any:
-            getattr(self.file, name)(self.ids[trial_id], *args, **kwargs)
-            return found(trial_id, *args, **kwargs)
-
-        return in_both
 
 
 def open_storage(root: Path) -> BaseStorage:
