@@ -81,6 +81,12 @@ clean: ## Remove caches and builds; .venv and logs/ stay
 	rm -rf build dist *.egg-info .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
+# A study of all agents with tables and of PPO, whose machine code is cached for later trainings.
+WARM_UP = runs=$$(mktemp -d) && $(BIN)/python compare.py --env Warehouse-v0 --algos \
+  qlearning ppo sarsa expected_sarsa double_qlearning monte_carlo dyna_q n_step_sarsa sarsa_lambda \
+  q_lambda n_step_tree_backup off_policy_monte_carlo dyna_q_plus prioritized_sweeping r_max \
+  qlearning_ucb --engine compiled --seeds 1 -n 2048 --jobs 1 --no-report -f "$$runs"; rm -rf "$$runs"
+
 # The stamp is written last, so a failed set-up is repeated.
 $(STAMP): pyproject.toml $(PINS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
@@ -91,3 +97,4 @@ $(STAMP): pyproject.toml $(PINS)
 	@$(BIN)/python -m pip install --quiet --no-deps -r requirements.txt
 	@$(BIN)/python -m pip install --quiet --no-build-isolation -c constraints.txt -e '.[dev]'
 	@touch $@
+	@[ -n "$$CI" ] || nohup nice sh -c '$(WARM_UP)' </dev/null >/dev/null 2>&1 &

@@ -339,6 +339,9 @@ def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
 
 def _draw(job: Job, analysis: StudyAnalysis) -> list[Path]:
     """Draw the figures and write the page; return the files."""
+    from rl_yardstick.pipeline.pictures import load_matplotlib
+
+    load_matplotlib()
     from rl_yardstick.report.figures import write_figures
     from rl_yardstick.report.page import write_report
     from rl_yardstick.report.page.frame import Report

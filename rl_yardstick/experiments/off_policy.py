@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import special
 
 from rl_yardstick.envs.bandits import LoggedData, read_log
 from rl_yardstick.mdp.transition_model import Floats, Ints
@@ -68,6 +68,8 @@ def arm_regressions(
 
     Source: Hoerl and Kennard (1970), "Ridge regression", Technometrics 12.
     """
+    from scipy import linalg
+
     centre, scale = contexts.mean(axis=0), contexts.std(axis=0)
     scale[scale == 0] = 1
     known, inputs = (
@@ -166,9 +168,9 @@ def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
     The interval is valid for many terms without dominating ones: check the effective sample size.
     It does not cover the bias of an estimator.
     """
-    mean = float(terms.mean())
-    reach = float(stats.t.isf((1 - confidence) / 2, len(terms) - 1) * stats.sem(terms))
-    return Estimate(mean, mean - reach, mean + reach, len(terms))
+    n, mean = len(terms), float(terms.mean())
+    reach = -float(special.stdtrit(n - 1, (1 - confidence) / 2) * (terms.std(ddof=1) / n**0.5))
+    return Estimate(mean, mean - reach, mean + reach, n)
 
 
 def difference_in_value(
@@ -183,7 +185,7 @@ def difference_in_value(
     found = mean_reward(first.doubly_robust - second.doubly_robust, 1 - 0.05 / n_comparisons)
     apart = first.weights - second.weights
     variance = float((apart**2).mean() * (first.errors**2).mean()) / len(apart)
-    half = float(stats.t.isf(0.05 / n_comparisons / 2, len(apart) - 1)) * np.sqrt(variance)
+    half = -float(special.stdtrit(len(apart) - 1, 0.05 / n_comparisons / 2)) * np.sqrt(variance)
     half = max(half, found.high - found.point)
     return replace(found, low=found.point - half, high=found.point + half)
 

@@ -153,7 +153,7 @@ def process_pool(n_workers: int) -> ProcessPool:
     """A pool of processes that have imported the libraries, and use one thread each."""
     forks = sys.platform not in ("win32", "darwin")  # where forked libraries crash
     context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
-    context.set_forkserver_preload(["rl_yardstick.pipeline.training"])
+    context.set_forkserver_preload(["rl_yardstick.experiments.preloaded"])
     for library in ("OMP", "MKL", "OPENBLAS"):  # small networks are slower with more
         os.environ[f"{library}_NUM_THREADS"] = "1"
     return ProcessPool(n_workers, initializer=_follow_parent, context=context)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum, moments_by_spreading, walked
-from rl_yardstick.mdp.graph import PolicyChain, reachable_states
+from rl_yardstick.mdp.graph import PolicyChain
 from rl_yardstick.mdp.planning import action_value
 from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
@@ -351,7 +351,7 @@ class LimitedEpisodes:
         return visits
 
     def _visited(self) -> Ints:
-        return np.flatnonzero(reachable_states(self.model, actions_used(self.model, self.policy)))
+        return np.flatnonzero(self.model.reached_by(actions_used(self.model, self.policy)))
 
     def _rows(self, states: Ints) -> tuple[Floats, Ints, Bools]:
         """Rows of n states: prob, next_state (as indices into these n states), terminated."""

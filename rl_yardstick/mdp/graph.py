@@ -16,41 +16,6 @@ from rl_yardstick.machine_code.compiling import compiled
 from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
 
-def reachable_states(model: TransitionModel, allowed: Bools) -> Bools:
-    """The states that are visited, with positive probability, by allowed actions."""
-    # A single memory layout, so that Numba compiles once.
-    edges = model.prob, model.next_state, model.terminated, np.ascontiguousarray(allowed)
-    return _flooded(*edges, model.initial > 0)
-
-
-@compiled
-def _flooded(
-    prob: Floats, next_state: AnyInts, terminated: Bools, allowed: Bools, found: Bools
-) -> Bools:
-    """Add all states reachable from ``found`` to ``found``, in place."""
-    n_states, n_actions, n_outcomes = prob.shape
-    stack = np.empty(n_states, np.int64)
-    height = 0
-    for state in range(n_states):
-        if found[state]:
-            stack[height] = state
-            height += 1
-    while height > 0:
-        height -= 1
-        state = stack[height]
-        for action in range(n_actions):
-            if not allowed[state, action]:
-                continue
-            for k in range(n_outcomes):
-                reached = next_state[state, action, k]
-                leads = prob[state, action, k] > 0 and not terminated[state, action, k]
-                if leads and not found[reached]:
-                    found[reached] = True
-                    stack[height] = reached
-                    height += 1
-    return found
-
-
 def steps_to_end(model: TransitionModel, allowed: Bools, target: Bools) -> tuple[Ints, Ints]:
     """The fewest transitions of positive probability to a termination or to a target state.
 
@@ -169,7 +134,7 @@ class PolicyChain:
         ``states``, bool of shape (S,), must be closed under the policy.
         """
         if states is None:
-            states = reachable_states(model, policy > 0)
+            states = model.reached_by(policy > 0)
         listed = np.flatnonzero(states)
         place = np.cumsum(states) - 1
         weight = (policy[listed][:, :, None] * model.prob[listed]).ravel()

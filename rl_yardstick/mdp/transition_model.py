@@ -163,10 +163,18 @@ class TransitionModel:
         These are the possible starting states and all states that transitions reach from them
         without ending the episode. The rows of all other states are meaningless.
         """
-        from rl_yardstick.mdp.graph import reachable_states
+        return _read_only(self.reached_by(np.ones(self.prob.shape[:2], np.bool_)))
 
-        everything = np.ones((self.n_states, self.n_actions), np.bool_)
-        return _read_only(reachable_states(self, everything))
+    def reached_by(self, allowed: Bools) -> Bools:
+        """The states that ``allowed`` actions, bool of shape (S, A), visit; bool of shape (S,)."""
+        leads = (self.prob > 0) & ~self.terminated & allowed[:, :, None]
+        found = self.initial > 0
+        new = np.flatnonzero(found)
+        while len(new):
+            reached = self.next_state[new][leads[new]]
+            new = np.unique(reached[~found[reached]])
+            found[new] = True
+        return found
 
     def allowed_actions(self, mask: Bools | None = None) -> Bools:
         """The actions that planning may take, bool of shape (S, A); none in unreachable states.

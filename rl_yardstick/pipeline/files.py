@@ -14,9 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from numpy.lib.format import read_array
-from numpy.typing import NDArray
-
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.safe_files.files import UnsafeFileError, content_of
 
@@ -66,14 +63,16 @@ def read_json(path: Path, limit: int = MAX_TEXT) -> Any:
 
 def read_arrays(
     path: Path, shapes: Mapping[str, str], optional: Collection[str] = ()
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Any]:
     """Arrays of numbers in a NumPy archive, which is read as data; the ``optional`` may be missing.
 
     ``shapes`` has the names of arrays and of their axes: those of one name have the same length.
     """
+    from numpy.lib.format import read_array
+
     from rl_yardstick.safe_files.files import read_members
 
-    found: dict[str, NDArray[Any]] = {}
+    found: dict[str, Any] = {}
     lengths: dict[str, int] = {}
     try:
         members = read_members(read_bytes(path, MAX_ARRAYS))

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from rl_yardstick.envs.drawing import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, SHELF, WHITE, Colour
 from rl_yardstick.envs.drawing import ORANGE as AMBER
@@ -32,12 +31,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+def load_matplotlib() -> None:
+    """Load Matplotlib without its tables of help texts, which take half of the time."""
+    from matplotlib import artist
+
+    made, artist.kwdoc = artist.kwdoc, lambda artist: ""
+    import matplotlib.pyplot as plt  # noqa: F401
+
+    artist.kwdoc = made
+
+
 def draw(folder: Path, parts: Any) -> None:
     """Draw what a training has left into its folder; ``parts`` is the `Training`, at its end."""
     spec, evaluation, agent = parts.spec, parts.evaluation, parts.agent
     if not spec.pictures:
         return
     with parts.run.console.status("drawing the pictures"):
+        load_matplotlib()
         if parts.pulled is None or evaluation.evaluations_timesteps:
             scale = None if parts.final is None else parts.final.yardstick
             means = [float(np.mean(row)) for row in evaluation.evaluations_results]
@@ -154,7 +164,9 @@ def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> Non
     style: Any = {"color": GREY, "markersize": 3, "markeredgewidth": 0, "label": label}
     axes.plot(steps[::stride], returns[::stride], "o", **style)
     if (width := min(MOVING_AVERAGE_EPISODES, len(returns))) > 1:
-        smooth = pd.Series(returns).rolling(width, min_periods=1).mean()[::stride]
+        ends, sums = np.arange(1, len(returns) + 1), np.cumsum(returns)
+        sums[width:] -= sums[:-width].copy()
+        smooth = (sums / np.minimum(ends, width))[::stride]
         axes.plot(steps[::stride], smooth, color=ORANGE, label=f"{what}, mean of {width} episodes")
 
 

@@ -13,7 +13,8 @@ import re
 import sys
 from collections.abc import Iterable, Mapping
 from contextlib import closing, suppress
-from functools import cache
+from copy import deepcopy
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -75,9 +76,10 @@ _Loader.add_constructor(
 
 def read_yaml(path: Path) -> Any:
     """The plain values in a YAML file; UserError if it cannot be read, or asks for objects."""
-    return parse_yaml(read_text(path), str(path))
+    return deepcopy(parse_yaml(read_text(path), str(path)))
 
 
+@lru_cache  # a file is read for each agent, environment and trial
 def parse_yaml(text: str, where: str) -> Any:
     """The plain values that a text in YAML spells."""
     try:
@@ -188,7 +190,7 @@ def literal(text: str) -> Any:
         return _literal(ast.parse(text.strip(), mode="eval").body)
     if text.strip().startswith(("[", "{")):  # YAML has more literals, such as {a: 1}
         with suppress(UserError):
-            return parse_yaml(text, text)
+            return deepcopy(parse_yaml(text, text))
     return text
 
 

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
-from scipy import integrate, special, stats
+from scipy import special
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.bandits import QUANTILES, PullStatistics
@@ -211,6 +211,8 @@ class Belief:
 
 def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Belief:
     """The densities of an agent's posteriors, at all recorded moments."""
+    from scipy import stats
+
     spec = next(planned.spec for planned in results.planned if planned.agent == agent)
     means, parameters = statistics.true_means, statistics.posteriors
     # Parameters: mean and standard deviation of a normal, alpha and beta of a Beta distribution.
@@ -261,9 +263,12 @@ def lai_robbins_slope(means: ArrayLike) -> float:
 
 def best_of_normals(n: int) -> float:
     """The expected maximum of ``n`` independent standard normal variables."""
-    cdf, pdf = stats.norm.cdf, stats.norm.pdf
-    value, _ = integrate.quad(lambda x: x * n * pdf(x) * cdf(x) ** (n - 1), -np.inf, np.inf)
-    return float(value)
+    from scipy.integrate import quad
+
+    def weighted(x: float) -> Any:
+        return x * n * (np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)) * special.ndtr(x) ** (n - 1)
+
+    return float(quad(weighted, -np.inf, np.inf)[0])
 
 
 def best_expected_reward(env: gym.Env[object, object]) -> float | None:

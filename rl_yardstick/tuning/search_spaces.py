@@ -11,6 +11,7 @@ them. Settings are flat here: the name of a nested setting is dotted, as in
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -29,8 +30,9 @@ from optuna.trial import FixedTrial, Trial
 from pydantic import ValidationError
 from pydantic import dataclasses as checked
 
-from rl_yardstick.agents import load_algorithm
-from rl_yardstick.pipeline.components import constructor_parameters
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
+from rl_yardstick.experiments.pool import do_aside
+from rl_yardstick.pipeline.components import PACKAGES, constructor_parameters
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
 from rl_yardstick.pipeline.settings import COMPONENTS, HYPERPARAMS, SPECIAL, override, read_yaml
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -493,7 +495,13 @@ def _check(entries: Mapping[str, Dimension], where: str) -> None:
 
 @cache
 def _defaults(algo: str) -> Mapping[str, Any]:
-    """The default values of an agent's settings, as far as there are defaults."""
+    """The default values of an agent's settings, read by a worker, which has loaded PyTorch."""
+    package = ALGORITHMS[algo].entry_point.partition(":")[0].partition(".")[0]
+    is_known = package in PACKAGES and "torch" not in sys.modules
+    return do_aside(_read_defaults, algo) if is_known else _read_defaults(algo)
+
+
+def _read_defaults(algo: str) -> dict[str, Any]:
     algorithm = load_algorithm(algo)
     policies = algorithm.policy_aliases
     usual = next((name for name in policies if name.startswith("Mlp")), next(iter(policies), ""))

@@ -15,7 +15,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rl_yardstick.envs.layout import GridLayout
 from rl_yardstick.mdp.evaluation import actions_used
-from rl_yardstick.mdp.graph import reachable_states
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.files import replacing
@@ -62,10 +61,10 @@ def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | Non
         initial=model.initial,
         values=evaluator.values(policy),
         actions=policy[0],
-        visited=reachable_states(model, actions_used(model, policy)),
+        visited=model.reached_by(actions_used(model, policy)),
         optimal_values=optimal_values,
         optimal_actions=optimal_actions,
-        optimal_visited=reachable_states(model, optimal_actions),
+        optimal_visited=model.reached_by(optimal_actions),
     )
 
 
