@@ -150,8 +150,7 @@ class Retested:
     # Failed runs, with a score below half the best median; None if that is not defined.
     n_failed: int | None
     n_missing: int = 0
-    # How much better it is than the shipped settings, and the ends of the interval of that.
-    gain: tuple[float, float, float] | None = None
+    gain: tuple[float, float, float] | None = None  # over the shipped settings; its interval
 
 
 @dataclass(frozen=True)

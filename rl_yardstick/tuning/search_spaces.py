@@ -1,8 +1,7 @@
 """Search spaces: read from files, sampled by Optuna, and inverted from settings to parameters.
 
 ``hyperparams/search_spaces/ALGO.yml`` maps environment ids to ranges and choices, see
-`docs/tuning.md`. An environment's entry overrides ``default`` name by name; null removes a
-name.
+`docs/tuning.md`. An environment's entry overrides ``default`` by name; null removes a name.
 
 Each dimension of a space converts between its settings and the parameters that Optuna stores for
 them. Settings are flat here: the name of a nested setting is dotted, as in
@@ -496,7 +495,7 @@ def _check(entries: Mapping[str, Dimension], where: str) -> None:
 @cache
 def _defaults(algo: str) -> Mapping[str, Any]:
     """The default values of an agent's settings, read by a worker, which has loaded PyTorch."""
-    package = ALGORITHMS[algo].entry_point.partition(":")[0].partition(".")[0]
+    package = ALGORITHMS[algo].entry_point.partition(".")[0]
     is_known = package in PACKAGES and "torch" not in sys.modules
     return do_aside(_read_defaults, algo) if is_known else _read_defaults(algo)
 

@@ -50,8 +50,7 @@ SECONDS_TO_WAIT = 120  # for other users of the same database, such as a dashboa
 MOST_FAILURES = 5
 # Scores from here on are the optimum, up to rounding.
 OPTIMAL_SCORE = 1 - 1e-6
-# A search ends with this many settings at the optimum on all seeds, or with as many as are
-# re-tested, if that is more.
+# A search ends with this many settings at the optimum, or with as many as are re-tested.
 ENOUGH_AT_OPTIMUM = 10
 
 # Attributes of the study, and of trials beside Optuna's own data.
