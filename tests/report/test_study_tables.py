@@ -40,8 +40,8 @@ def of_lake(cpu=(), **changes):
 
 LEGEND = (
     "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts as 0. "
-    "±: the standard deviation of runs. Bold: the best agents, where another is shown to be "
-    "worse on average. In brackets: processor time of the median run."
+    "±: the standard deviation of runs. Bold: the best agents, where another is worse. In "
+    "brackets: processor time of the median run."
 )
 
 
