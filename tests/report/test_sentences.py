@@ -28,9 +28,7 @@ from rl_yardstick.verdicts import Best, judge
 from tests.report import made_up
 from tests.report.test_page import Page
 
-NAN, INF = math.nan, math.inf
-
-
+NAN = math.nan
 MEANS = {"a": 100.0, "b": 90.0, "c": 80.0}
 TWO = {"a": 100.0, "b": 90.0}
 
