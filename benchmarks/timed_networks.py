@@ -19,36 +19,15 @@ from rl_yardstick.agents import load_algorithm
 from timing import Benchmark, Rows
 
 LAKE = {"n_steps": 128, "batch_size": 512, "n_epochs": 10, "learning_rate": 1e-3, "ent_coef": 0.01}
-ZOO_PPO = {
-    "n_steps": 32,
-    "batch_size": 256,
-    "gae_lambda": 0.8,
-    "gamma": 0.98,
-    "n_epochs": 20,
-    "ent_coef": 0.0,
-    "learning_rate": 1e-3,
-}
-SMALL_DQN = {
-    "learning_rate": 1e-3,
-    "batch_size": 32,
-    "buffer_size": 10_000,
-    "learning_starts": 1_000,
-    "train_freq": 4,
-    "target_update_interval": 250,
-    "policy_kwargs": {"net_arch": [64, 64]},
-}
-ZOO_DQN = {
-    "learning_rate": 2.3e-3,
-    "batch_size": 64,
-    "buffer_size": 100_000,
-    "learning_starts": 1_000,
-    "target_update_interval": 10,
-    "train_freq": 256,
-    "gradient_steps": 128,
-    "exploration_fraction": 0.16,
-    "exploration_final_eps": 0.04,
-    "policy_kwargs": {"net_arch": [256, 256]},
-}
+ZOO_PPO = {"n_steps": 32, "batch_size": 256, "gae_lambda": 0.8, "gamma": 0.98, "n_epochs": 20}
+ZOO_PPO |= {"ent_coef": 0.0, "learning_rate": 1e-3}
+SMALL_DQN: dict[str, Any] = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 1e-3}
+SMALL_DQN |= {"batch_size": 32, "buffer_size": 10_000, "learning_starts": 1_000}
+SMALL_DQN |= {"train_freq": 4, "target_update_interval": 250}
+ZOO_DQN: dict[str, Any] = {"policy_kwargs": {"net_arch": [256, 256]}, "learning_rate": 2.3e-3}
+ZOO_DQN |= {"batch_size": 64, "buffer_size": 100_000, "learning_starts": 1_000}
+ZOO_DQN |= {"train_freq": 256, "gradient_steps": 128, "target_update_interval": 10}
+ZOO_DQN |= {"exploration_fraction": 0.16, "exploration_final_eps": 0.04}
 # By name: agent, environment, number of environments, settings, steps compiled and otherwise.
 TASKS: dict[str, tuple[str, str, int, dict[str, Any], int, int]] = {
     "PPO, CartPole, rl_zoo3's settings": ("ppo", "CartPole-v1", 8, ZOO_PPO, 100_000, 12_000),

@@ -15,10 +15,9 @@ FORM = ["Idea", "Update", "Code", "Example", "Limitations", "Run", "Source"]
 
 @pytest.fixture(scope="module")
 def fill_pages():
-    before = list(sys.path)
-    sys.path[:0] = [str(DOCS / "_ext"), str(DOCS / "scripts")]
-    yield importlib.import_module("fill_pages")
-    sys.path[:] = before
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "path", [str(DOCS / "_ext"), str(DOCS / "scripts"), *sys.path])
+        yield importlib.import_module("fill_pages")
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
@@ -16,19 +17,7 @@ ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 HASH = re.compile(r"--hash=sha256:[0-9a-f]{64}")
 
-# The first versions without the holes named, each as the project's own change notes say. They were
-# read in copies of summer 2026: what became known later, or stands in no change notes, is missing.
-MENDED = {
-    "fonttools": ("4.61.0", "CVE-2025-66034"),
-    "h11": ("0.16.0", "GHSA-vqfr-h8mv-ghfj"),
-    "jinja2": ("3.1.6", "GHSA-cpwx-vrp4-4pq7"),
-    # Also, in 12.2.0, CVE-2026-40192 and CVE-2026-42308 to -42311; in 12.1.1, CVE-2026-25990.
-    "pillow": ("12.3.0", "CVE-2026-59197 CVE-2026-59199 CVE-2026-59204 CVE-2026-59205"),
-    "pyyaml": ("5.4", "CVE-2020-14343"),
-    "setuptools": ("83.0.0", "GHSA-h35f-9h28-mq5c"),
-    "urllib3": ("2.7.0", "GHSA-mf9v-mfxr-j63j GHSA-qccp-gfcp-xxvc"),
-    "werkzeug": ("3.1.6", "GHSA-29vq-49wr-vm6x"),
-}
+MENDED = yaml.safe_load((ROOT / "tests" / "mended.yml").read_text(encoding="utf-8"))
 
 
 def entries(file):

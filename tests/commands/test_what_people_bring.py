@@ -9,6 +9,7 @@ from pathlib import Path
 
 import optuna
 import pytest
+import yaml
 
 from rl_yardstick.agents import ALGORITHMS
 
@@ -16,6 +17,7 @@ HERE, ROOT = Path(__file__).parent, Path(__file__).parents[2]
 FLAT = "rl_yardstick.envs.wrappers.FlattenToDiscrete"
 BINS = "rl_yardstick.envs.wrappers.DiscretizeObservation"
 SHORT = ("-n", "2000", "--seed", "0")
+STRANGE = yaml.safe_load((HERE / "strange_environments.yml").read_text(encoding="utf-8"))
 
 
 @pytest.fixture
@@ -30,17 +32,7 @@ def train(type_in_own_folder, own_folder):
     return run
 
 
-REFUSED = [
-    ("FourValues", "qlearning", "step returns 4 values, not observation, reward, terminated"),
-    ("NoSeed", "qlearning", "Gymnasium calls reset(seed=..., options=...), which the environment"),
-    ("Half", "qlearning", "at step 0 the observation 0.5 is not in Discrete(5)"),
-    ("Seven", "qlearning", "the observation 7 is not in Discrete(5)"),
-    ("OtherShape", "ppo", "has the shape (3,), and its space the shape (2,)"),
-    ("Huge", "qlearning", "a table for 1,000,000,000 states and 2 actions is too large"),
-]
-
-
-@pytest.mark.parametrize(("env", "algo", "said"), REFUSED)
+@pytest.mark.parametrize(("env", "algo", "said"), STRANGE["refused"])
 def test_what_nothing_can_learn_on_is_refused(train, own_folder, env, algo, said):
     code, out, err = train(env, algo=algo)
     assert (code, err.count("\n")) == (2, 1), out + err
@@ -48,15 +40,8 @@ def test_what_nothing_can_learn_on_is_refused(train, own_folder, env, algo, said
     assert not (own_folder / "logs").exists()
 
 
-NOTED = [
-    ("Unseeded", "qlearning", "the environment is not reproducible: seed 0 gave "),
-    ("EpisodeInfo", "qlearning", "the environment's own info['episode'] is left out"),
-    ("OtherType", "ppo", "observations are float64, and their space is float32"),
-]
-
-
 @pytest.mark.filterwarnings("ignore:.*WARN.*:UserWarning")  # Gymnasium's own
-@pytest.mark.parametrize(("env", "algo", "said"), NOTED)
+@pytest.mark.parametrize(("env", "algo", "said"), STRANGE["noted"])
 def test_what_is_odd_is_said_once(train, own_folder, env, algo, said):
     code, out, err = train(env, *(["-params", "n_steps:64"] if algo == "ppo" else []), algo=algo)
     assert (code, out.count(said)) == (0, 1), out + err
@@ -75,15 +60,7 @@ def test_a_wrapper_of_ours_fits_and_is_named_to_be_typed(train, env):
     assert "note:" not in out
 
 
-@pytest.mark.parametrize(
-    ("fault", "said"),
-    [
-        ("keys", "P must map states, the numbers 0 to 4, to mappings of actions; it begins with"),
-        ("triples", "state 0, action 0: an outcome is (probability, next state, reward, termina"),
-        ("start", "has P, but not initial_state_distrib, the probabilities of the starting"),
-        ("single", "return -4 of -4 "),
-    ],
-)
+@pytest.mark.parametrize(("fault", "said"), STRANGE["tables"].items())
 def test_a_wrong_table_of_outcomes(train, fault, said):
     code, out, err = train("Known", "--env-kwargs", f"fault:{fault}")
     assert (code, err) == (0, ""), err
@@ -123,14 +100,6 @@ def test_a_log_with_the_index_of_pandas(type_in_own_folder, own_folder):
     with pytest.warns(UserWarning, match="first column, which counts the rows, is left out"):
         code, _, err = type_in_own_folder("train.py", *words)
     assert (code, err) == (0, "")
-
-
-def test_a_pointer_in_place_of_a_model(type_in_own_folder, own_folder):
-    (own_folder / "model.zip").write_text("version https://git-lfs.github.com/spec/v1\noid 1\n")
-    for words in ("enjoy.py model.zip --algo ppo --env CartPole-v1", "yardstick inspect model.zip"):
-        code, _, err = type_in_own_folder(*words.split())
-        assert (code, err.count("\n")) == (2, 1)
-        assert "model.zip is a Git LFS pointer, not the file: run git lfs pull" in err
 
 
 def test_results_go_into_what_is_no_file(type_in_own_folder, own_folder):

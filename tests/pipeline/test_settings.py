@@ -221,9 +221,7 @@ CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": "auto"}}
 SCALE = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": "auto"}}
 SHORT = {"max_episode_steps": 200}
 # Nobody knows the model of what depends on earlier actions.
-STICKY = {
-    "env_wrapper": {"gymnasium.wrappers.StickyAction": {"repeat_action_probability": 0.2}},
-}
+STICKY = {"env_wrapper": {"gymnasium.wrappers.StickyAction": {"repeat_action_probability": 0.2}}}
 POOR = {"shelf_reward": -1, "step_reward": -0.01, "goal_reward": 1}
 
 
