@@ -88,7 +88,7 @@ def test_what_the_readme_and_the_page_on_compare_point_to_is_there():
         assert len(files) >= 4
         assert [name for name in files if not (folder / name).exists()] == []
     targets = set(re.findall(r"\bmake ([a-z]+)", README))
-    assert targets == {"train", "test", "docs", "bench"}
+    assert targets == {"train", "test", "docs"}
     makefile = (ROOT / "Makefile").read_text()
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
 
