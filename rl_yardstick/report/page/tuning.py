@@ -163,7 +163,7 @@ def _said(value: Any) -> str:
 LEFT_OUT = "-"
 # The sections by template; importances are left out without data.
 SECTIONS = (
-    *(("verdict", "What was found"), ("history", "History"), ("importances", "What matters")),
+    *(("verdict", "Result"), ("history", "History"), ("importances", "Importance")),
     *(("cost", "Cost"), ("trials", "All trials")),
 )
 
