@@ -164,9 +164,8 @@ def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> Non
     style: Any = {"color": GREY, "markersize": 3, "markeredgewidth": 0, "label": label}
     axes.plot(steps[::stride], returns[::stride], "o", **style)
     if (width := min(MOVING_AVERAGE_EPISODES, len(returns))) > 1:
-        ends, sums = np.arange(1, len(returns) + 1), np.cumsum(returns)
-        sums[width:] -= sums[:-width].copy()
-        smooth = (sums / np.minimum(ends, width))[::stride]
+        counts = np.minimum(np.arange(1, len(returns) + 1), width)
+        smooth = (np.convolve(returns, np.ones(width))[: len(returns)] / counts)[::stride]
         axes.plot(steps[::stride], smooth, color=ORANGE, label=f"{what}, mean of {width} episodes")
 
 
