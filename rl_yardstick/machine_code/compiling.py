@@ -34,7 +34,7 @@ from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator, NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
-from numba.core.registry import CPUDispatcher, cpu_target
+from numba.core.registry import CPUDispatcher
 from numba.core.types import unliteral
 
 from rl_yardstick.machine_code import WorkTime
@@ -116,7 +116,6 @@ class KeyedCache(FunctionCache):
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """The machine code for these argument types, or None where it has to be compiled."""
-        load_libraries()
         found = super().load_overload(signature, target_context) if _is_keyed(signature) else None
         if found is None:
             logger.info("compiling %s", self._py_func.__qualname__)
@@ -133,18 +132,6 @@ class KeyedCache(FunctionCache):
                 super().save_overload(signature, data)
         except (OSError, NotImplementedError) as error:  # a full disk: this process has the code
             logger.warning("the machine code of %s is not kept: %s", self._name, error)
-
-
-@cache
-def load_libraries() -> None:
-    """Load what Numba needs for any function, but not SciPy's linear algebra, to save 0.1 s."""
-    from numba.np import linalg
-
-    is_there, linalg.ensure_blas = linalg.ensure_blas, lambda: None
-    import numba.np.arraymath  # noqa: F401  # it asks whether they are there; functions ask again
-
-    linalg.ensure_blas = is_there
-    cpu_target.target_context.refresh()
 
 
 def _is_keyed(signature: Any) -> bool:
