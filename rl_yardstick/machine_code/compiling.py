@@ -34,7 +34,7 @@ from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator, NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
-from numba.core.registry import CPUDispatcher
+from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.types import unliteral
 
 from rl_yardstick.machine_code import WorkTime
@@ -132,6 +132,11 @@ class KeyedCache(FunctionCache):
                 super().save_overload(signature, data)
         except (OSError, NotImplementedError) as error:  # a full disk: this process has the code
             logger.warning("the machine code of %s is not kept: %s", self._name, error)
+
+
+def load_libraries() -> None:
+    """Load what Numba needs for any function, before it is needed."""
+    cpu_target.target_context.refresh()
 
 
 def _is_keyed(signature: Any) -> bool:
