@@ -46,6 +46,11 @@ for name in sys.argv[1:]:
     assert PACKAGES[-1] == "verdicts"
     expected[-1] += " scipy"  # it is SciPy's functions
     assert done.stdout.splitlines() == expected
+    # Nor does a study's own process load what only its workers need.
+    modules = "experiments.pool", "report.figures", "report.page"
+    loads = "".join(f"import rl_yardstick.{name}\n" for name in modules)
+    code = f"{loads}import sys\nsys.exit(not {{'torch', 'numba'}}.isdisjoint(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False).returncode == 0
 
 
 def test_every_imported_library_is_a_declared_dependency() -> None:

@@ -338,16 +338,15 @@ def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
 
 
 def _draw(job: Job, analysis: StudyAnalysis) -> list[Path]:
-    """Draw the figures and write the page; return the files."""
-    from rl_yardstick.pipeline.pictures import load_matplotlib
+    """Draw the figures and write the page, unless nothing is new; return the files."""
+    from rl_yardstick.report.page import current_files, write_report
 
-    load_matplotlib()
+    if files := current_files(analysis.results, job.command):
+        return files
     from rl_yardstick.report.figures import write_figures
-    from rl_yardstick.report.page import write_report
     from rl_yardstick.report.page.frame import Report
     from rl_yardstick.report.series import study_series
 
-    root = analysis.results.root
     with job.console.status("drawing the figures"):
         series = study_series(analysis)
         files = write_figures(series)
@@ -358,9 +357,10 @@ def _draw(job: Job, analysis: StudyAnalysis) -> list[Path]:
 
         with job.console.status("watching"):
             learning = write_first_pages(analysis, job.workers.n_at_once, job.stop)
+    root, pages = analysis.results.root, [one.place for one in learning if one.place]
     with job.console.status("writing the page"):
         write_report(Report(series, job.command, learning=learning), root / "report.html")
-    return [*files, *(root / one.place for one in learning if one.place), root / "report.html"]
+    return [*files, *(root / place for place in (*pages, "report.html"))]
 
 
 # --- from flags to a study ------------------------------------------------------------------------

@@ -162,8 +162,8 @@ def main() -> int:
     job = Job(root, cli.command_line(), table_console(), stop, workers, not args.no_report)
     job.console.print(tuning.study.title, style="bold")
     with job.console.status("loading the libraries"):
-        from rl_yardstick.tuning.searching import open_search, storage_errors
-    with held(root), workers, storage_errors(root):
+        from rl_yardstick.tuning.searching import open_search
+    with held(root), workers:
         search = open_search(tuning, root)
         search.deadline = deadline
         print_opened(job, search)

@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager, suppress
+from functools import cache, partial
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any, Self
@@ -174,9 +175,11 @@ def _follow_parent() -> None:
 
 
 def do_aside(function: Callable[..., Any], *args: Any) -> Any:
-    """Call a function in another process, so that this one need not import the libraries."""
-    with process_pool(1) as pool:
-        return pool.schedule(function, args=args).result()
+    """Call a function in a lasting process, so that this one need not import the libraries."""
+    return _aside().schedule(function, args=args).result()
+
+
+_aside = cache(partial(process_pool, 1))
 
 
 # --- doing runs -----------------------------------------------------------------------------------

@@ -18,8 +18,6 @@ from rl_yardstick.envs.drawing import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, S
 from rl_yardstick.envs.drawing import ORANGE as AMBER
 from rl_yardstick.envs.layout import GOAL, PRIZE, START, TRAP, WALL, GridLayout
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.pipeline.environments import training_changes
-from rl_yardstick.pipeline.evaluation.value_maps import ValueMap, value_map
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 from rl_yardstick.pipeline.files import replacing
 from rl_yardstick.safe_files.files import NO_LIMIT, content_of
@@ -29,6 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap, Normalize
     from matplotlib.figure import Figure
+
+    from rl_yardstick.pipeline.evaluation.value_maps import ValueMap
 
 
 def load_matplotlib() -> None:
@@ -46,6 +46,9 @@ def draw(folder: Path, parts: Any) -> None:
     spec, evaluation, agent = parts.spec, parts.evaluation, parts.agent
     if not spec.pictures:
         return
+    from rl_yardstick.pipeline.environments import training_changes
+    from rl_yardstick.pipeline.evaluation.value_maps import value_map
+
     with parts.run.console.status("drawing the pictures"):
         load_matplotlib()
         if parts.pulled is None or evaluation.evaluations_timesteps:

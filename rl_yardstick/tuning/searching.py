@@ -10,11 +10,10 @@ by seed.
 from __future__ import annotations
 
 import math
-import sqlite3
+import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
@@ -23,11 +22,9 @@ from typing import Any
 import optuna
 from optuna import Study, Trial
 from optuna.distributions import distribution_to_json
-from optuna.exceptions import StorageInternalError
-from optuna.storages import BaseStorage, RDBStorage
+from optuna.storages import BaseStorage, JournalStorage
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.exc import SQLAlchemyError
-from sqlalchemy.pool import NullPool
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.experiments.plan import PlannedRun, plan
@@ -44,8 +41,7 @@ from rl_yardstick.tuning.suggesting import (
 )
 from rl_yardstick.tuning.tuning_spec import AUTO, STEPS, TuningSpec
 
-OWN_FILE = "trials.db"
-SECONDS_TO_WAIT = 120  # for other users of the same database, such as a dashboard
+OWN_FILE = "trials.log"
 # If this many trials fail at the start without a success, the settings are not the reason.
 MOST_FAILURES = 5
 # Scores from here on are the optimum, up to rounding.
@@ -361,16 +357,14 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
         raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
     suggestions.check(root)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    with storage_errors(root):
-        _check_own(root)
-        study = optuna.create_study(
-            study_name=tuning.study.name,
-            storage=open_storage(root),
-            sampler=SeededSampler(tuning),
-            pruner=optuna.pruners.NopPruner(),  # `is_hopeless` decides
-            direction="minimize" if tuning.is_cost else "maximize",
-            load_if_exists=True,
-        )
+    study = optuna.create_study(
+        study_name=tuning.study.name,
+        storage=open_storage(root),
+        sampler=SeededSampler(tuning),
+        pruner=optuna.pruners.NopPruner(),  # `is_hopeless` decides
+        direction="minimize" if tuning.is_cost else "maximize",
+        load_if_exists=True,
+    )
     ranges = suggestions.space.distributions
     as_json = {name: distribution_to_json(kind) for name, kind in ranges.items()}
     asked = tuning.identity(suggestions.shipped, as_json)
@@ -388,50 +382,33 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
 
 
 def open_storage(root: Path) -> BaseStorage:
-    """Open the SQLite file of the trials in the search's folder."""
+    """Open the journal of the trials in the search's folder, which this process has locked.
 
-    def connect() -> sqlite3.Connection:
-        # By path, because in a URL some characters have another meaning. With a log of writes, no
-        # rollback journal lies beside the file after a kill. Closing writes the log into the file.
-        found = sqlite3.connect(root / OWN_FILE, SECONDS_TO_WAIT, check_same_thread=False)
-        found.execute("PRAGMA journal_mode = WAL")
-        return found
-
-    options = {"creator": connect, "poolclass": NullPool}
-    return RDBStorage(f"sqlite:///{OWN_FILE}", engine_kwargs=options)
-
-
-def _check_own(root: Path) -> None:
-    """Raise UserError, before anything is written, if another program made the file of trials."""
+    Raises:
+        UserError: if the file is damaged, or holds a study of another program.
+    """
     path = root / OWN_FILE
-    journal = path.with_name(f"{path.name}-journal")
-    if journal.exists():
-        fault = "opening the trials could change other files: look at it, and remove it"
-        raise UserError(f"{journal} is no file of ours, and {fault}")
-    if not path.exists():
-        return
-    query = (
-        "SELECT study_name FROM studies AS s WHERE NOT EXISTS (SELECT 1 FROM study_user_attributes "
-        "AS a WHERE a.study_id = s.study_id AND a.key = ?) AND (study_name != ? OR EXISTS "
-        "(SELECT 1 FROM trials AS t WHERE t.study_id = s.study_id))"
-    )
-    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as there:
-        try:
-            foreign = there.execute(query, (ASKED, root.name)).fetchone()
-        except sqlite3.DatabaseError as error:  # none, or without Optuna's tables
-            raise UserError(f"{path}: {one_line(error)}") from error
-    if foreign:
-        way_out = "read it with Optuna, or give this search another --name"
-        raise UserError(f"{path} holds the Optuna study {foreign[0]} of another program: {way_out}")
-
-
-@contextmanager
-def storage_errors(root: Path) -> Iterator[None]:
-    """Tell a failure of the storage in one line: the disk is full, or the file is damaged."""
+    if path.exists():
+        content = path.read_bytes()
+        if whole := content.rfind(b"\n") + 1 - len(content):  # the end of a write before a kill
+            os.truncate(path, len(content) + whole)
     try:
-        yield
-    except (SQLAlchemyError, StorageInternalError) as error:
-        cause: BaseException = error
-        while cause.__cause__ is not None:  # the database's own words
-            cause = cause.__cause__
-        raise UserError(f"{root / OWN_FILE}: {one_line(cause)}") from error
+        storage = JournalStorage(JournalFileBackend(str(path), _LockedAlready(str(path))))
+        studies = storage.get_all_studies()
+    except (ValueError, LookupError, TypeError, AssertionError) as error:
+        raise UserError(f"{path} is damaged: {one_line(error)}") from error
+    for study in studies:
+        if ASKED not in study.user_attrs and storage.get_n_trials(study._study_id):
+            other = f"holds the Optuna study {study.study_name} of another program"
+            raise UserError(f"{path} {other}: give this search another --name")
+    return storage
+
+
+class _LockedAlready(JournalFileOpenLock):
+    """No further lock: the process holds that of the folder, which a kill gives back."""
+
+    def acquire(self) -> bool:
+        return True
+
+    def release(self) -> None:
+        pass

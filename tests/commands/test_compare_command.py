@@ -102,6 +102,13 @@ def test_films_and_pages_of_training(typed, own_folder, monkeypatch):
     assert place in out.split()
     assert "<h1>qlearning on FrozenLake-v1</h1>" in (study / place).read_text(encoding="utf-8")
     assert f'href="{place}"' in (study / "report.html").read_text(encoding="utf-8")
+    # The page stays as it is where nothing is new.
+    page = study / "report.html"
+    made = page.stat().st_mtime_ns
+    assert {place, page.name} <= {*typed("compare.py", *words)[1].split()}
+    assert page.stat().st_mtime_ns == made
+    assert typed("compare.py", *words, "--metric", "best")[0] == 0
+    assert page.stat().st_mtime_ns > made
     films = sorted(study.glob("films/*"))
     assert [path.name for path in films] == [f"qlearning_FrozenLake-v1_{n}.gif" for n in (20, 40)]
     for path in films:

@@ -154,9 +154,10 @@ def columns(path):
 def search(checkout):
     """Search for hyperparameters, and list the trials."""
     import optuna
+    from optuna.storages.journal import JournalFileBackend, JournalStorage
 
     code = checkout.started(ASKED["search"])
-    storage = f"sqlite:///{next((checkout.folder / 'search').rglob('trials.db'))}"
+    storage = JournalStorage(JournalFileBackend(str(next(checkout.folder.rglob("trials.log")))))
     trials = optuna.load_study(storage=storage, study_name=None).trials
     told = [f"{trial.number} {trial.state.name} {trial.values} {trial.params}" for trial in trials]
     return [f"exit {code}", *told]

@@ -156,8 +156,11 @@ def test_the_storage_keeps_the_search(toy, monkeypatch):
     search = toy.opened(tuning, "a {b} %20 c?d")
     toy.search(search)
     assert params(toy.opened(tuning, "a {b} %20 c?d")) == params(search)
-    (search.root / "trials.db").write_bytes(b"no database any more" * 100)
-    with pytest.raises(UserError, match=r"trials\.db: file is not a database$"):
+    journal = search.root / "trials.log"
+    journal.write_bytes(journal.read_bytes() + b'{"op_code":2,"wor')  # a kill during a write
+    assert params(toy.opened(tuning, "a {b} %20 c?d")) == params(search)
+    journal.write_bytes(b"no journal any more\n" * 100)
+    with pytest.raises(UserError, match=r"trials\.log is damaged: "):
         toy.opened(tuning, "a {b} %20 c?d")
 
 

@@ -8,11 +8,15 @@ A page is a list of sections. Each is made by a function that takes a `Report` a
 from __future__ import annotations
 
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 
 from markupsafe import Markup
 
-from rl_yardstick.pipeline.files import write_text
+from rl_yardstick.experiments import plan
+from rl_yardstick.experiments.results import StudyResults
+from rl_yardstick.pipeline.files import read_text, write_text
+from rl_yardstick.pipeline.run import RECORD, versions
 from rl_yardstick.report.page import frame, result_sections, world_sections
 from rl_yardstick.report.page.frame import Report, Section
 
@@ -33,10 +37,28 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
 )
 
 
+def current_files(results: StudyResults, command: str) -> list[Path]:
+    """A study's figures and page, if this version made them from the same runs; else none."""
+    root, mark = results.root, _mark(results, command).encode()
+    found = [*root.glob("figures/*"), *root.glob("learning/*/*.html"), *root.glob("report.html")]
+    is_whole = len(found) > 1 and found[-1].name == "report.html"
+    is_current = is_whole and found[-1].read_bytes().endswith(mark)
+    return sorted(found, key=lambda path: path.stat().st_mtime_ns) if is_current else []
+
+
 def write_report(report: Report, path: Path) -> None:
     """Write the page of a study: one self-contained file, which needs no network."""
     sections = [section for make in SECTIONS if (section := make(report)) is not None]
-    write_text(path, render(report, sections))
+    mark = _mark(report.analysis.results, report.command)
+    write_text(path, render(report, sections) + mark)
+
+
+def _mark(results: StudyResults, command: str) -> str:
+    """The last line of a page: a digest of what it was made from."""
+    records = [results.root / plan.RECORD, *(run.path / RECORD for run in results.finished)]
+    texts = [read_text(path) for path in records if path.exists()]
+    told = command, versions(), results.left_out, results.failures, *texts
+    return f"\n<!-- {sha256(repr(told).encode()).hexdigest()} -->\n"
 
 
 def render(report: Report, sections: list[Section]) -> str:
