@@ -14,12 +14,14 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
+from rl_yardstick.agents.common.given_spaces import in_given_spaces
 from rl_yardstick.agents.common.masks import numbers_in
 from rl_yardstick.agents.common.model_files import TablePolicy
 from rl_yardstick.envs.known_models import (
@@ -71,7 +73,12 @@ class ReferenceAgent(OnlineAlgorithm):
 
     def _choose_actions(self) -> NDArray[Any]:
         assert self._last_obs is not None
-        return self.predict(self._last_obs)[0]
+        return BaseAlgorithm.predict(self, self._last_obs)[0]
+
+    @in_given_spaces
+    def predict(self, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """The policy's actions, as the library's `predict`."""
+        return super().predict(*args, **kwargs)
 
 
 class RandomAgent(ReferenceAgent):
@@ -151,6 +158,7 @@ class PlanningAgent(OnlineAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ActionTablePolicy": ActionTablePolicy}
     policy: ActionTablePolicy
+    observed = ("Discrete",)
     default_gamma: ClassVar[float] = 0.99
     planner: ClassVar[Callable[..., Any]]
     hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
@@ -219,6 +227,7 @@ class PlanningAgent(OnlineAlgorithm):
     def _learn_from(self, transitions: Any) -> None:
         self._steps[transitions.dones] = 0
 
+    @in_given_spaces
     def predict(
         self,
         observation: NDArray[Any] | dict[str, NDArray[Any]],

@@ -72,7 +72,9 @@ class Claim:
         if isinstance(self.base, BlackjackEnv):
             return blackjack_observations()
         space = self.base.observation_space
-        return np.arange(space.n) if isinstance(space, gym.spaces.Discrete) else None
+        if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
+            return None
+        return np.arange(space.n)
 
 
 def claim_of(base: Env) -> Claim | None:

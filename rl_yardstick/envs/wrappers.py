@@ -14,6 +14,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
 from rl_yardstick.envs.argument_checks import check_flag, check_number, check_whole_number
+from rl_yardstick.envs.finite_spaces import MOST_MEMBERS, bijection_of
 from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints
 
 Env = gym.Env[Any, Any]
@@ -194,62 +195,75 @@ class WithoutEpisodeInfo(gym.Wrapper[Any, Any, Any, Any]):
 
 
 class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
-    """Turns an observation of several whole numbers into one, the last number counting fastest.
+    """Turns observations and actions of finite spaces into one number each, from 0 on.
+
+    The last number of an observation counts fastest (see `envs.finite_spaces`). A space that is
+    not finite stays as it is, and so do actions that are Discrete from 0.
 
     Args:
-        env: an environment whose observations are MultiDiscrete, a Tuple or Dict of Discrete, or
-            a Discrete, which is counted from zero afterwards.
+        env: an environment whose observations or actions are MultiDiscrete, a Tuple or Dict,
+            MultiBinary, a Box of whole numbers, or Discrete from another number than 0.
+        kept: classes of observations that stay as they are, by their names.
 
     Raises:
-        ValueError: if the observations are none of these.
+        ValueError: if no space of the environment can be numbered.
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        RecordConstructorArgs.__init__(self)
+    def __init__(self, env: gym.Env[Any, Any], kept: Sequence[str] = ()) -> None:
+        RecordConstructorArgs.__init__(self, kept=kept)
         gym.ObservationWrapper.__init__(self, env)
-        space = env.observation_space
-        parts: list[Any] = [space]
-        if isinstance(space, spaces.Dict):
-            parts = list(space.spaces.values())
-        elif isinstance(space, spaces.Tuple):
-            parts = list(space.spaces)
-        self._keys = list(space.spaces) if isinstance(space, spaces.Dict) else None
-        discrete = [part for part in parts if isinstance(part, spaces.Discrete)]
-        if isinstance(space, spaces.MultiDiscrete):
-            self._sizes, self._first = space.nvec.ravel().tolist(), space.start.ravel().tolist()
-        elif discrete and len(discrete) == len(parts):
-            self._sizes = [int(part.n) for part in discrete]
-            self._first = [int(part.start) for part in discrete]
-        else:
+        observed: Any = env.observation_space
+        self._seen = bijection_of(observed, ("Discrete", *kept))
+        self._done = bijection_of(env.action_space)
+        if self._seen is None and self._done is None and not isinstance(observed, spaces.Discrete):
             raise ValueError(
-                "FlattenToDiscrete needs MultiDiscrete, a Tuple or Dict of Discrete, or Discrete, "
-                f"not {space}"
+                "FlattenToDiscrete needs MultiDiscrete, a Tuple or Dict, MultiBinary, Discrete or "
+                f"a Box of whole numbers, of at most {MOST_MEMBERS:,} members, not {observed}"
             )
-        self.observation_space = spaces.Discrete(math.prod(self._sizes))
+        if self._seen is not None:
+            self.observation_space = self._seen.numbers_space
+        if self._done is not None:
+            self.action_space = self._done.numbers_space
 
-    def observation(self, observation: Any) -> int:
+    @property
+    def changes_actions(self) -> bool:
+        """Whether actions have other numbers than in the environment."""
+        return self._done is not None
+
+    def observation(self, observation: Any) -> Any:
         """The number of one observation."""
-        if isinstance(observation, np.ndarray):
-            observation = observation.ravel().tolist()
-        elif self._keys is not None:
-            observation = [observation[key] for key in self._keys]
-        index = 0
-        values = observation if isinstance(observation, Sequence) else [observation]
-        for value, size, first in zip(values, self._sizes, self._first, strict=True):
-            index = index * size + int(value) - first
-        return index
+        return observation if self._seen is None else self._seen.number(observation)
 
-    def map_observations(self, batch: ArrayLike) -> Ints:
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """As the environment, with the action of a number."""
+        return super().step(action if self._done is None else self._done.member(int(action)))
+
+    def map_observations(self, batch: Any) -> Any:
         """The numbers of many observations, shape (n,).
 
         Args:
             batch: whole numbers, the first axis counting the observations; for a Tuple, its parts
                 side by side in shape (n, parts).
         """
-        parts = np.asarray(batch, np.int64)
-        places = parts.reshape(len(parts), -1) - self._first
-        numbers: Ints = np.ravel_multi_index(tuple(places.T), self._sizes)
-        return numbers
+        return np.asarray(batch) if self._seen is None else self._seen.numbers(batch)
+
+
+class NumberedSpaces(FlattenToDiscrete):
+    """`FlattenToDiscrete` as agents for tables put it around an environment by themselves.
+
+    Their model files keep the spaces inside, and their `predict` takes observations of these.
+    """
+
+    @property
+    def original_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        """The spaces of observations and of actions inside."""
+        return self.env.observation_space, self.env.action_space
+
+
+def numbered(env: Env, kept: Sequence[str]) -> Env:
+    """The environment in `NumberedSpaces` where this changes a space; ``kept`` as there."""
+    found = bijection_of(env.observation_space, kept) or bijection_of(env.action_space)
+    return env if found is None else NumberedSpaces(env, kept)
 
 
 class OneHotObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):

@@ -161,7 +161,7 @@ def _fitting_wrappers(spec: TrainSpec, env: Env) -> Iterator[str]:
     for kind, kwargs in ((FlattenToDiscrete, {}), (DiscretizeObservation, bins)):
         with suppress(ValueError):
             wrapped: Any = kind(env, **kwargs)
-            n = wrapped.observation_space.n
+            n = getattr(wrapped.observation_space, "n", 0)
             if n > MOST_BOXES or ALGORITHMS[spec.algo].env_misfit(wrapped):
                 continue
             name = f"{kind.__module__}.{kind.__name__}"
@@ -174,12 +174,17 @@ def _fitting_wrappers(spec: TrainSpec, env: Env) -> Iterator[str]:
 
 
 def _wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = None) -> Env:
-    """An environment in its wrappers, with masks outermost for agents that need them."""
+    """An environment in its wrappers, with masks outermost for agents that need them.
+
+    Finite spaces are numbered for an agent on tables that needs it.
+    """
     for where in ("env_wrapper", *(["train_env_wrapper"] if training else [])):
         for component in getattr(spec, where):
             env = build(component, gym.Wrapper, where, spec.gym_packages, folder, env)
+    entry = ALGORITHMS.get(spec.algo)
+    env = env if entry is None else entry.numbered(env)
     # Without masks, `check_fit` names the agents that fit.
-    needs_masks = spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks and has_masks(env)
+    needs_masks = entry is not None and entry.needs_masks and has_masks(env)
     try:
         is_masked = spec.algorithm.get("mask_actions", False) or needs_masks
         return ActionMasks(env) if is_masked else env

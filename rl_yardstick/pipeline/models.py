@@ -210,7 +210,9 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
 
     spec, algorithm = model.spec, load_algorithm(model.spec.algo)
     if _has_own_load(algorithm):
-        return load(spec, model.path, env, device=spec.device)
+        own: Any = load(spec, model.path, env, device=spec.device)
+        own.translation = None  # the environments of `pipeline.environments` number their spaces
+        return own  # type: ignore[no-any-return]
     unused = ConstantSchedule(0.0)
     replaced: dict[str, Any] = {
         "learning_rate": 0.0,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +19,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 import rl_yardstick
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
+from rl_yardstick.envs.finite_spaces import describe
 from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.machine_code.compiling import compile_timer
 from rl_yardstick.pipeline import callbacks
@@ -66,6 +67,8 @@ def train(
         run.console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     resumes = resumes and run.state_path.exists()
     agent = make_agent(spec, run.path, resumes)
+    for line in numbered_spaces(agent):
+        run.console.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
     try:
         training = Training(spec, run, agent, resumes)
         with closing(training.judge.env):
@@ -233,6 +236,16 @@ class Training:
             **({} if pulled is None else {"regret": pulled.regret, "pulls": asdict(pulled)}),
             **({} if refusal is None else {"model_refused": refusal}),
         }
+
+
+def numbered_spaces(agent: Any) -> Iterator[str]:
+    """A line for each space whose members the agent numbers."""
+    original = getattr(agent, "original_spaces", None) or ()
+    own = agent.observation_space, agent.action_space
+    roles = ("observations", "rows"), ("actions", "columns")
+    for space, numbers, (role, unit) in zip(original, own, roles, strict=False):
+        if space != numbers:
+            yield f"{role}: {describe(space)} as {numbers.n:,} {unit}"
 
 
 def make_agent(spec: TrainSpec, folder: Path | None, appending: bool = False) -> BaseAlgorithm:

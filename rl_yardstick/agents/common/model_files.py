@@ -7,6 +7,7 @@ import json
 import re
 import warnings
 import zipfile
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -215,6 +216,10 @@ class JsonAlgorithm(BaseAlgorithm):
     # `_setup_model` rebuilds these, or they belong to one process.
     _rebuilt: ClassVar[tuple[str, ...]] = ("lr_schedule", "policy_class", "start_time")
 
+    @abstractmethod
+    def use_spaces_of(self, given: Any) -> None:
+        """Let `predict` use the spaces of an environment that was given, or None."""
+
     def save(
         self,
         path: str | Path | io.BufferedIOBase,
@@ -284,6 +289,7 @@ class JsonAlgorithm(BaseAlgorithm):
         budget = Budget(len(content))
         members = read_model_members(content, budget)
         data = {**cls._read_data(members, budget, path, custom_objects), **kwargs}
+        given = env
         if env is not None:
             env = cls._wrap_env(env, data["verbose"])
             check_for_correct_spaces(env, data["observation_space"], data["action_space"])
@@ -307,6 +313,7 @@ class JsonAlgorithm(BaseAlgorithm):
         with charged_tensors(budget):
             model._setup_model()
         model.__dict__.update(data)
+        model.use_spaces_of(given)
         if "seed" in kwargs:
             model.set_random_seed(kwargs["seed"])
         tables: Any = load_tensors(members[TABLES], budget) if TABLES in members else None

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 from gymnasium import spaces
 
+from rl_yardstick.envs.finite_spaces import bijection_of
 from rl_yardstick.machine_code.compiling import inlined
 
 TieBreaking = Literal["random", "first"]
@@ -142,9 +143,9 @@ def _words(annotation: Any) -> list[str]:
 def check_space(agent: object, role: str, space: spaces.Space[Any]) -> None:
     """Refuse spaces other than Discrete ones that start at 0."""
     if not isinstance(space, spaces.Discrete) or space.start != 0:
-        raise ValueError(
-            f"{type(agent).__name__} needs {role} in a Discrete space that starts at 0, not {space}"
-        )
+        fault = f"{type(agent).__name__} needs {role} in a Discrete space that starts at 0"
+        way_out = "wrap each environment in rl_yardstick.envs.wrappers.FlattenToDiscrete"
+        raise ValueError(f"{fault}, not {space}{f': {way_out}' if bijection_of(space) else ''}")
 
 
 def check_vectors(agent: object, space: spaces.Space[Any]) -> None:

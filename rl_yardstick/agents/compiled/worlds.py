@@ -28,6 +28,7 @@ from rl_yardstick.envs.wrappers import (
     DiscretizeObservation,
     FlattenToDiscrete,
     IdleActionMasks,
+    NumberedSpaces,
     OneHotObservation,
     ScaleReward,
     TerminationReward,
@@ -343,7 +344,7 @@ COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
 CART_POLE_WRAPPERS = {DiscretizeObservation, *COMMON_WRAPPERS}
 MODEL_WRAPPERS = {
     *COMMON_WRAPPERS,
-    *(ActionMasks, IdleActionMasks),
+    *(ActionMasks, IdleActionMasks, NumberedSpaces),
     *(ClipReward, FlattenToDiscrete, OneHotObservation, ScaleReward, TerminationReward),
 }
 

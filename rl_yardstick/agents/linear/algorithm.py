@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from rl_yardstick.agents.common.algorithm import Transitions
 from rl_yardstick.agents.common.exploration import first_best
+from rl_yardstick.agents.common.given_spaces import in_given_spaces
 from rl_yardstick.agents.common.masks import numbers_in
 from rl_yardstick.agents.common.model_files import TablePolicy
 from rl_yardstick.agents.common.settings import (
@@ -395,6 +396,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TilePolicy": TilePolicy}
     policy: TilePolicy
+    observed = ("Box", "Discrete")
     parameters = {"gamma": np.float64}  # noqa: RUF012
     ranges = {"gamma": SHARE}  # noqa: RUF012
     values_states: ClassVar[bool] = False
@@ -473,6 +475,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
     def _make_workspace(self, rng: np.random.Generator, n: int) -> TileWorkspace:
         return TileWorkspace(self.compiled_agent(rng), self.observation_space, rng, n)
 
+    @in_given_spaces
     def predict(
         self,
         observation: NDArray[Any] | dict[str, NDArray[Any]],

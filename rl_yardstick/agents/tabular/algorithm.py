@@ -22,6 +22,7 @@ from rl_yardstick.agents.common.exploration import (
     action_probabilities,
     draws_per_choice,
 )
+from rl_yardstick.agents.common.given_spaces import in_given_spaces
 from rl_yardstick.agents.common.masks import (
     MaskBufferPolicy,
     check_masks_exist,
@@ -161,7 +162,8 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     Args:
         policy: ``"QTablePolicy"``.
-        env: environment with `Discrete` observations and actions, or its id.
+        env: environment with finite observations and actions, or its id. Those other than
+            `Discrete` from 0 are numbered; `predict` takes and returns the original ones.
         learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N(s, a).
         gamma: discount factor.
         exploration: ``"epsilon_greedy"``; ``"boltzmann"`` (softmax of value / temperature); or
@@ -198,6 +200,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": QTablePolicy}
     policy: QTablePolicy
+    observed = ("Discrete",)
     n_tables: ClassVar[int] = 1
     parameters = {"gamma": np.float64, "skip_terminal_update": np.bool_}  # noqa: RUF012
     ranges = {"gamma": SHARE, "temperature": POSITIVE, **EPSILONS}  # noqa: RUF012
@@ -374,6 +377,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     # Prediction and exploration.
 
+    @in_given_spaces
     def predict(
         self,
         observation: NDArray[Any] | dict[str, NDArray[Any]],

@@ -272,7 +272,9 @@ def evaluator_of_single(spec: TrainSpec) -> ExactEvaluator | None:
     if spec.env_wrapper or spec.gym_packages:  # of which the key tells too little
         return _evaluator(spec)
     masks = spec.algorithm.get("mask_actions", False)
-    key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks))
+    with closing(make_single_env(spec)) as env:
+        seen = env.observation_space  # some agents number the members of a space
+    key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks, seen))
     found = _kept.pop(key, None) or _evaluator(spec)
     if found is not None and found.model.n_states <= MOST_STATES_KEPT:
         _kept[key] = found

@@ -1,0 +1,207 @@
+"""Finite spaces of Gymnasium as the numbers from 0 on, and back.
+
+A member of a finite space is a row of whole numbers, its *digits*: one for Discrete, one for each
+entry of MultiDiscrete, MultiBinary and a Box of whole numbers, and those of all parts for Tuple and
+Dict. The last digit counts fastest.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from rl_yardstick.mdp.transition_model import Ints
+
+Space = spaces.Space[Any]
+
+# The largest space that is numbered without being asked: a model file holds no larger one.
+MOST_MEMBERS = 10_000_000
+_BEYOND = 1 << 63  # numbers are of 64 bits
+
+
+class Bijection:
+    """Numbers the members of a finite space from 0 to n - 1.
+
+    A batch of members is what a VecEnv gives: arrays whose first axis counts the members, in a
+    dictionary for Dict and a tuple for Tuple.
+
+    Args:
+        space: Discrete, MultiDiscrete, MultiBinary, a bounded Box of whole numbers, or a Tuple or
+            Dict of such spaces, also nested.
+
+    Attributes:
+        space: the space.
+        numbers_space: the space of the numbers, ``Discrete(n)``.
+
+    Raises:
+        ValueError: if the space is not finite, or has 2 ** 63 members or more.
+    """
+
+    def __init__(self, space: Space) -> None:
+        self.space = space
+        ranges = list(_ranges(space))
+        self._sizes, self._first = ([one[i] for one in ranges] for i in (0, 1))
+        n = 1
+        for size, first in ranges:
+            n *= size  # an image has thousands of digits
+            if n >= _BEYOND or not -_BEYOND <= first < _BEYOND - size:
+                raise ValueError(f"{describe(space)} has too many members")
+        self.numbers_space = spaces.Discrete(n)
+        steps = [math.prod(self._sizes[i + 1 :]) for i in range(len(ranges))]
+        self._digits = np.array([*zip(self._sizes, self._first, steps, strict=True)], np.int64)
+        self._digits = self._digits.reshape(len(ranges), 3)
+
+    def number(self, member: Any) -> int:
+        """The number of one member; ValueError if it is not in the space."""
+        index = 0
+        digits = [digit for _, value in _leaves(self.space, member) for digit in _list(value)]
+        if len(digits) != len(self._sizes):
+            raise self._not_inside(member)
+        for digit, size, first in zip(digits, self._sizes, self._first, strict=True):
+            place = int(digit) - first
+            if not 0 <= place < size or digit != place + first:
+                raise self._not_inside(member)
+            index = index * size + place
+        return index
+
+    def numbers(self, batch: Any) -> Ints:
+        """The numbers of a batch of members, shape (n,); ValueError if one is not in the space.
+
+        An array, or a list of members, holds the digits of each member in a row.
+        """
+        parts = [batch]
+        if isinstance(batch, dict | tuple):
+            parts = [value for _, value in _leaves(self.space, batch)]
+        columns = [np.asarray(part).reshape(len(part), -1) for part in parts]
+        digits = np.concatenate(columns, axis=1)
+        if digits.shape[1] != len(self._sizes):
+            raise self._not_inside(digits[0].tolist())
+        size, first, step = self._digits.T
+        places = digits.astype(np.int64) - first
+        outside = ((places < 0) | (places >= size) | (digits != places + first)).any(axis=1)
+        if outside.any():
+            raise self._not_inside(digits[outside.argmax()].tolist())
+        numbers: Ints = places @ step
+        return numbers
+
+    def member(self, number: int) -> Any:
+        """The member of a number."""
+        return _built(self.space, iter(self._digits_of([number])[0]), ())
+
+    def members(self, numbers: ArrayLike) -> Any:
+        """The members of numbers of shape (n,), as a batch."""
+        digits = self._digits_of(numbers)
+        return _built(self.space, iter(digits.T), (len(digits),))
+
+    def _digits_of(self, numbers: ArrayLike) -> Ints:
+        size, first, step = self._digits.T
+        digits: Ints = np.asarray(numbers, np.int64)[:, None] // step % size + first
+        return digits
+
+    def _not_inside(self, member: Any) -> ValueError:
+        shown = textwrap.shorten(str(member), 80)
+        return ValueError(f"{shown} is not in {describe(self.space)}")
+
+    def is_batch(self, members: Any) -> bool:
+        """Whether the argument is a batch of members, and not one member."""
+        if isinstance(members, list):
+            return True
+        for part, value in _leaves(self.space, members):
+            return np.ndim(value) > len(part.shape or ())
+        return False
+
+
+def bijection_of(space: Space, kept: Iterable[str] = ("Discrete",)) -> Bijection | None:
+    """The bijection of a finite space with at most `MOST_MEMBERS` members; None for others.
+
+    None too for the spaces whose class is named in ``kept``, if they count from 0.
+    """
+    if type(space).__name__ in kept and counts_from_zero(space):
+        return None
+    try:
+        found = Bijection(space)
+    except ValueError:
+        return None
+    return found if found.numbers_space.n <= MOST_MEMBERS else None
+
+
+def counts_from_zero(space: Space) -> bool:
+    """Whether each Discrete and MultiDiscrete in a space starts at 0, as one-hot encodings need."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        return all(map(counts_from_zero, _parts(space)))
+    return not np.any(getattr(space, "start", 0))
+
+
+def describe(space: Space) -> str:
+    """A space in at most 80 characters: ``Dict(agent: Box(2), target: Box(2))``."""
+    return textwrap.shorten(_words(space), 80, placeholder=" ...")
+
+
+def _words(space: Space) -> str:
+    if isinstance(space, spaces.Dict):
+        return f"Dict({', '.join(f'{key}: {_words(one)}' for key, one in space.spaces.items())})"
+    if isinstance(space, spaces.Tuple):
+        return f"Tuple({', '.join(map(_words, space.spaces))})"
+    if isinstance(space, spaces.Box):
+        return f"Box({'x'.join(map(str, space.shape))})"
+    return str(space)
+
+
+def _parts(space: Any) -> Iterable[Space]:
+    return space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
+
+
+def _ranges(space: Space) -> Iterator[tuple[int, int]]:
+    """The number of values of each digit, and the first of them."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        for part in _parts(space):
+            yield from _ranges(part)
+    elif isinstance(space, spaces.Discrete):
+        yield int(space.n), int(space.start)
+    elif isinstance(space, spaces.MultiDiscrete):
+        yield from zip(space.nvec.ravel().tolist(), space.start.ravel().tolist(), strict=True)
+    elif isinstance(space, spaces.MultiBinary) and math.prod(space.shape) < 63:
+        yield from [(2, 0)] * math.prod(space.shape)
+    elif isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.integer):
+        bounds = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)
+        yield from ((high - low + 1, low) for low, high in bounds)
+    else:
+        raise ValueError(f"{space} is not finite, or too large")
+
+
+def _leaves(space: Space, member: Any) -> Iterator[tuple[Space, Any]]:
+    """The spaces that have no parts, with their values in a member or a batch."""
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        yield space, member
+        return
+    keys = list(space.spaces) if isinstance(space, spaces.Dict) else range(len(space.spaces))
+    try:
+        values = [member[key] for key in keys]
+    except (LookupError, TypeError):
+        shown = textwrap.shorten(str(member), 80)
+        raise ValueError(f"{shown} is not in {describe(space)}") from None
+    for part, value in zip(_parts(space), values, strict=True):
+        yield from _leaves(part, value)
+
+
+def _list(value: Any) -> list[Any]:
+    return [value] if isinstance(value, int) else np.ravel(value).tolist()
+
+
+def _built(space: Space, digits: Iterator[Any], before: tuple[int, ...]) -> Any:
+    """A member or a batch, whose shape is ``before``, from digits of this shape."""
+    if isinstance(space, spaces.Dict):
+        return {key: _built(part, digits, before) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_built(part, digits, before) for part in space.spaces)
+    shape, dtype = space.shape or (), space.dtype
+    found: list[NDArray[Any]] = [next(digits) for _ in range(math.prod(shape))]
+    array = np.stack(found, axis=-1) if found else np.zeros((*before, 0))
+    array = array.reshape(*before, *shape).astype(dtype)
+    return array[()] if isinstance(space, spaces.Discrete) else array
