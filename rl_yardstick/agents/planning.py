@@ -14,7 +14,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
@@ -73,7 +72,7 @@ class ReferenceAgent(OnlineAlgorithm):
 
     def _choose_actions(self) -> NDArray[Any]:
         assert self._last_obs is not None
-        return BaseAlgorithm.predict(self, self._last_obs)[0]
+        return super().predict(self._last_obs)[0]
 
     @in_given_spaces
     def predict(self, *args: Any, **kwargs: Any) -> tuple[Any, Any]:

@@ -13,11 +13,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from rl_yardstick.envs.finite_spaces import (
-    Bijection,
-    bijection_of,
-    counts_from_zero,
-)
+from rl_yardstick.envs.finite_spaces import bijection_of, counts_from_zero, table_size
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -78,47 +74,31 @@ class AlgorithmEntry:
         return self.family in {"tabular", "linear", "planning"} and "Discrete" in self.observations
 
     def misfit(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> str:
-        """The reason why the agent cannot work with these spaces; empty if it can.
-
-        An agent with `numbers_spaces` can work with finite ones: see `numbered`.
-        """
-        reason = self.misfit_as_it_is(observation_space, action_space)
-        if not (reason and self.numbers_spaces):
-            return reason
-        found = bijection_of(observation_space, self.observations), bijection_of(action_space)
-        given = observation_space, action_space
-        numbers = [b.numbers_space if b else space for b, space in zip(found, given, strict=True)]
-        return self.misfit_as_it_is(*numbers) and reason + _size(observation_space, numbers[1])
-
-    def misfit_as_it_is(
-        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
-    ) -> str:
-        """The reason why the agent cannot work with these spaces, none of which is numbered."""
+        """The reason why the agent cannot work with these spaces; empty if it can."""
         for space, known, role in (
             (observation_space, self.observations, "observes"),
             (action_space, self.actions, "acts in"),
         ):
-            if not known:
+            if not known or (self.numbers_spaces and bijection_of(space, known) is not None):
                 continue
             if type(space).__name__ not in known:
-                return f"it {role} {' or '.join(known)} spaces, not {space}"
+                size = table_size(space, action_space) if self.numbers_spaces else ""
+                return f"it {role} {' or '.join(known)} spaces, not {space}{size}"
             # The one-hot encoding of Stable-Baselines3 and every table count from zero.
             if not counts_from_zero(space):
-                kind = "Discrete spaces" if isinstance(space, spaces.Discrete) else "parts"
-                return f"it needs {kind} that start at 0, not {space}"
+                wrapper = "TransformObservation" if role == "observes" else "TransformAction"
+                way_out = "" if bijection_of(space) else f": shift it by Gymnasium's {wrapper}"
+                return f"it needs Discrete spaces that start at 0, not {space}{way_out}"
         shape = self.observation_shape
         if shape is not None and observation_space.shape != shape:
             return f"it needs observations of shape {shape}, not {observation_space.shape}"
         return ""
 
     def numbered(self, env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-        """The environment; where the agent needs it, its spaces are numbered."""
+        """The environment; finite spaces that do not fit are numbered, with `numbers_spaces`."""
         from rl_yardstick.envs.wrappers import numbered
 
-        spaces_of_env = env.observation_space, env.action_space
-        if not self.numbers_spaces or not self.misfit_as_it_is(*spaces_of_env):
-            return env
-        return numbered(env, self.observations)
+        return numbered(env, self.observations, self.actions) if self.numbers_spaces else env
 
     def env_misfit(self, env: gym.Env[Any, Any]) -> str:
         """The reason why the agent cannot work with the environment; empty if it can."""
@@ -132,16 +112,6 @@ class AlgorithmEntry:
                 "info['action_mask']"
             )
         return self.misfit(env.observation_space, env.action_space)
-
-
-def _size(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> str:
-    """The size of a table that is too large for finite observations; empty for others."""
-    try:
-        n_states, n_actions = Bijection(observation_space).numbers_space.n, action_space.n  # type: ignore[attr-defined]
-    except (ValueError, AttributeError):
-        return ""
-    needed = 8e-9 * float(n_states) * float(n_actions)
-    return f" (a table of {n_states:.3g} x {n_actions} needs {needed:,.0f} GB)"
 
 
 def is_bandit(env: gym.Env[Any, Any]) -> bool:

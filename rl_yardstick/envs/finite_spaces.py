@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -45,28 +46,28 @@ class Bijection:
 
     def __init__(self, space: Space) -> None:
         self.space = space
-        ranges = list(_ranges(space))
-        self._sizes, self._first = ([one[i] for one in ranges] for i in (0, 1))
-        n = 1
-        for size, first in ranges:
+        ranges, n = list(_ranges(space)), 1
+        steps = []
+        for size, first in reversed(ranges):
+            steps.append(n)
             n *= size  # an image has thousands of digits
-            if n >= _BEYOND or not -_BEYOND <= first < _BEYOND - size:
+            if not 0 < n < _BEYOND or not -_BEYOND <= first < _BEYOND - size:
                 raise ValueError(f"{describe(space)} has too many members")
-        self.numbers_space = spaces.Discrete(n)
-        steps = [math.prod(self._sizes[i + 1 :]) for i in range(len(ranges))]
-        self._digits = np.array([*zip(self._sizes, self._first, steps, strict=True)], np.int64)
-        self._digits = self._digits.reshape(len(ranges), 3)
+        self.numbers_space, self._ranges = spaces.Discrete(n), ranges
+        rows = [(*ends, step) for ends, step in zip(ranges, steps[::-1], strict=True)]
+        self._digits = np.array(rows, np.int64).reshape(len(rows), 3)
 
     def number(self, member: Any) -> int:
         """The number of one member; ValueError if it is not in the space."""
-        index = 0
-        digits = [digit for _, value in _leaves(self.space, member) for digit in _list(value)]
-        if len(digits) != len(self._sizes):
-            raise self._not_inside(member)
-        for digit, size, first in zip(digits, self._sizes, self._first, strict=True):
+        index, digits = 0, list[Any]()
+        for _, value in _leaves(self.space, member):
+            digits += [value] if isinstance(value, int) else np.ravel(value).tolist()
+        if len(digits) != len(self._ranges):
+            raise _not_in(self.space, member)
+        for digit, (size, first) in zip(digits, self._ranges, strict=True):
             place = int(digit) - first
             if not 0 <= place < size or digit != place + first:
-                raise self._not_inside(member)
+                raise _not_in(self.space, member)
             index = index * size + place
         return index
 
@@ -75,38 +76,28 @@ class Bijection:
 
         An array, or a list of members, holds the digits of each member in a row.
         """
-        parts = [batch]
-        if isinstance(batch, dict | tuple):
-            parts = [value for _, value in _leaves(self.space, batch)]
-        columns = [np.asarray(part).reshape(len(part), -1) for part in parts]
-        digits = np.concatenate(columns, axis=1)
-        if digits.shape[1] != len(self._sizes):
-            raise self._not_inside(digits[0].tolist())
+        in_parts = isinstance(batch, dict | tuple)
+        parts = [value for _, value in _leaves(self.space, batch)] if in_parts else [batch]
+        digits = np.concatenate([np.reshape(part, (len(part), -1)) for part in parts], axis=1)
+        if digits.shape[1] != len(self._ranges):
+            raise _not_in(self.space, digits[0].tolist())
         size, first, step = self._digits.T
         places = digits.astype(np.int64) - first
         outside = ((places < 0) | (places >= size) | (digits != places + first)).any(axis=1)
         if outside.any():
-            raise self._not_inside(digits[outside.argmax()].tolist())
+            raise _not_in(self.space, digits[outside.argmax()].tolist())
         numbers: Ints = places @ step
         return numbers
 
     def member(self, number: int) -> Any:
         """The member of a number."""
-        return _built(self.space, iter(self._digits_of([number])[0]), ())
+        return self.members(np.int64(number))
 
     def members(self, numbers: ArrayLike) -> Any:
         """The members of numbers of shape (n,), as a batch."""
-        digits = self._digits_of(numbers)
-        return _built(self.space, iter(digits.T), (len(digits),))
-
-    def _digits_of(self, numbers: ArrayLike) -> Ints:
-        size, first, step = self._digits.T
-        digits: Ints = np.asarray(numbers, np.int64)[:, None] // step % size + first
-        return digits
-
-    def _not_inside(self, member: Any) -> ValueError:
-        shown = textwrap.shorten(str(member), 80)
-        return ValueError(f"{shown} is not in {describe(self.space)}")
+        given = np.asarray(numbers, np.int64)
+        digits = (given // step % size + first for size, first, step in self._digits)
+        return _built(self.space, digits, given.shape)
 
     def is_batch(self, members: Any) -> bool:
         """Whether the argument is a batch of members, and not one member."""
@@ -124,11 +115,10 @@ def bijection_of(space: Space, kept: Iterable[str] = ("Discrete",)) -> Bijection
     """
     if type(space).__name__ in kept and counts_from_zero(space):
         return None
-    try:
+    with suppress(ValueError):
         found = Bijection(space)
-    except ValueError:
-        return None
-    return found if found.numbers_space.n <= MOST_MEMBERS else None
+        return found if found.numbers_space.n <= MOST_MEMBERS else None
+    return None
 
 
 def counts_from_zero(space: Space) -> bool:
@@ -136,6 +126,16 @@ def counts_from_zero(space: Space) -> bool:
     if isinstance(space, spaces.Dict | spaces.Tuple):
         return all(map(counts_from_zero, _parts(space)))
     return not np.any(getattr(space, "start", 0))
+
+
+def table_size(observations: Space, actions: Space) -> str:
+    """The size of a table for finite observations, in words; empty if one is not finite."""
+    try:
+        n_states, n_actions = (Bijection(each).numbers_space.n for each in (observations, actions))
+    except ValueError:
+        return ""
+    needed = 8e-9 * float(n_states) * float(n_actions)
+    return f" (a table of {n_states:.3g} x {n_actions} needs {needed:,.0f} GB)"
 
 
 def describe(space: Space) -> str:
@@ -151,6 +151,10 @@ def _words(space: Space) -> str:
     if isinstance(space, spaces.Box):
         return f"Box({'x'.join(map(str, space.shape))})"
     return str(space)
+
+
+def _not_in(space: Space, member: Any) -> ValueError:
+    return ValueError(f"{textwrap.shorten(str(member), 80)} is not in {describe(space)}")
 
 
 def _parts(space: Any) -> Iterable[Space]:
@@ -184,14 +188,9 @@ def _leaves(space: Space, member: Any) -> Iterator[tuple[Space, Any]]:
     try:
         values = [member[key] for key in keys]
     except (LookupError, TypeError):
-        shown = textwrap.shorten(str(member), 80)
-        raise ValueError(f"{shown} is not in {describe(space)}") from None
+        raise _not_in(space, member) from None
     for part, value in zip(_parts(space), values, strict=True):
         yield from _leaves(part, value)
-
-
-def _list(value: Any) -> list[Any]:
-    return [value] if isinstance(value, int) else np.ravel(value).tolist()
 
 
 def _built(space: Space, digits: Iterator[Any], before: tuple[int, ...]) -> Any:
@@ -200,8 +199,7 @@ def _built(space: Space, digits: Iterator[Any], before: tuple[int, ...]) -> Any:
         return {key: _built(part, digits, before) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
         return tuple(_built(part, digits, before) for part in space.spaces)
-    shape, dtype = space.shape or (), space.dtype
-    found: list[NDArray[Any]] = [next(digits) for _ in range(math.prod(shape))]
-    array = np.stack(found, axis=-1) if found else np.zeros((*before, 0))
-    array = array.reshape(*before, *shape).astype(dtype)
+    shape = (*before, *(space.shape or ()))
+    found: list[NDArray[Any]] = [next(digits) for _ in range(math.prod(space.shape or ()))]
+    array = (np.stack(found, axis=-1) if found else np.zeros(0)).reshape(shape).astype(space.dtype)
     return array[()] if isinstance(space, spaces.Discrete) else array

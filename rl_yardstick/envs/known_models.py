@@ -28,7 +28,6 @@ from rl_yardstick.envs.wrappers import (
     DiscretizeObservation,
     FlattenToDiscrete,
     IdleActionMasks,
-    NumberedSpaces,
     OneHotObservation,
     ScaleReward,
     TerminationReward,
@@ -52,7 +51,7 @@ TRANSPARENT_WRAPPERS = frozenset(
         "stable_baselines3.common.monitor.Monitor",
     }
 )
-OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation, NumberedSpaces)
+OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation)
 
 Judgement = tuple[Claim | None, ModelCheck | None]
 
@@ -188,8 +187,8 @@ def _folds(wrapper: Wrapper) -> bool:
     """Whether a wrapper keeps the states, and changes rewards at most in a known way."""
     if type(wrapper) is TerminationReward:
         return not wrapper.on_truncation
-    if isinstance(wrapper, FlattenToDiscrete) and wrapper.changes_actions:
-        return False
+    if type(wrapper) is FlattenToDiscrete:
+        return not wrapper.changes_actions
     if type(wrapper) is ClipReward:  # as it was made, with the same bounds for all rewards
         is_own = getattr(wrapper.func, "__qualname__", "").startswith("ClipReward.__init__.")
         return is_own and all(np.ndim(bound) == 0 for bound in wrapper._saved_kwargs.values())

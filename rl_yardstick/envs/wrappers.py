@@ -197,25 +197,41 @@ class WithoutEpisodeInfo(gym.Wrapper[Any, Any, Any, Any]):
 class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
     """Turns observations and actions of finite spaces into one number each, from 0 on.
 
-    The last number of an observation counts fastest (see `envs.finite_spaces`). A space that is
-    not finite stays as it is, and so do actions that are Discrete from 0.
+    The last number of an observation counts fastest (see `envs.finite_spaces`). Spaces that are not
+    finite stay as they are.
 
     Args:
         env: an environment whose observations or actions are MultiDiscrete, a Tuple or Dict,
-            MultiBinary, a Box of whole numbers, or Discrete from another number than 0.
-        kept: classes of observations that stay as they are, by their names.
+            MultiBinary, a Box of whole numbers, or Discrete.
+        observations: classes of observations that stay as they are if they count from 0.
+        actions: classes of actions, likewise.
+
+    Attributes:
+        changes_actions: whether actions have other numbers than in the environment.
+        original_spaces: the spaces inside, which only a wrapper made by `numbered` has.
 
     Raises:
         ValueError: if no space of the environment can be numbered.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], kept: Sequence[str] = ()) -> None:
-        RecordConstructorArgs.__init__(self, kept=kept)
+    original_spaces: tuple[spaces.Space[Any], spaces.Space[Any]]
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        observations: Sequence[str] = ("Discrete",),
+        actions: Sequence[str] = ("Discrete",),
+    ) -> None:
+        RecordConstructorArgs.__init__(self, observations=observations, actions=actions)
         gym.ObservationWrapper.__init__(self, env)
         observed: Any = env.observation_space
-        self._seen = bijection_of(observed, ("Discrete", *kept))
-        self._done = bijection_of(env.action_space)
-        if self._seen is None and self._done is None and not isinstance(observed, spaces.Discrete):
+        self._seen = bijection_of(observed, observations)
+        self._done = bijection_of(env.action_space, actions)
+        if (
+            self._seen is None
+            and self._done is None
+            and type(observed).__name__ not in observations
+        ):
             raise ValueError(
                 "FlattenToDiscrete needs MultiDiscrete, a Tuple or Dict, MultiBinary, Discrete or "
                 f"a Box of whole numbers, of at most {MOST_MEMBERS:,} members, not {observed}"
@@ -224,11 +240,7 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
             self.observation_space = self._seen.numbers_space
         if self._done is not None:
             self.action_space = self._done.numbers_space
-
-    @property
-    def changes_actions(self) -> bool:
-        """Whether actions have other numbers than in the environment."""
-        return self._done is not None
+        self.changes_actions = self._done is not None
 
     def observation(self, observation: Any) -> Any:
         """The number of one observation."""
@@ -248,22 +260,17 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
         return np.asarray(batch) if self._seen is None else self._seen.numbers(batch)
 
 
-class NumberedSpaces(FlattenToDiscrete):
-    """`FlattenToDiscrete` as agents for tables put it around an environment by themselves.
+def numbered(env: Env, observations: Sequence[str], actions: Sequence[str]) -> Env:
+    """The environment in `FlattenToDiscrete`, where this changes a space, for an agent on tables.
 
-    Their model files keep the spaces inside, and their `predict` takes observations of these.
+    The agent's file keeps the spaces inside, and its `predict` takes observations of these.
     """
-
-    @property
-    def original_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        """The spaces of observations and of actions inside."""
-        return self.env.observation_space, self.env.action_space
-
-
-def numbered(env: Env, kept: Sequence[str]) -> Env:
-    """The environment in `NumberedSpaces` where this changes a space; ``kept`` as there."""
-    found = bijection_of(env.observation_space, kept) or bijection_of(env.action_space)
-    return env if found is None else NumberedSpaces(env, kept)
+    inside = env.observation_space, env.action_space
+    if bijection_of(inside[0], observations) is None and bijection_of(inside[1], actions) is None:
+        return env
+    wrapped = FlattenToDiscrete(env, observations, actions)
+    wrapped.original_spaces = inside
+    return wrapped
 
 
 class OneHotObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):

@@ -174,10 +174,7 @@ def _fitting_wrappers(spec: TrainSpec, env: Env) -> Iterator[str]:
 
 
 def _wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = None) -> Env:
-    """An environment in its wrappers, with masks outermost for agents that need them.
-
-    Finite spaces are numbered for an agent on tables that needs it.
-    """
+    """An environment in its wrappers, with masks outermost for agents that need them."""
     for where in ("env_wrapper", *(["train_env_wrapper"] if training else [])):
         for component in getattr(spec, where):
             env = build(component, gym.Wrapper, where, spec.gym_packages, folder, env)

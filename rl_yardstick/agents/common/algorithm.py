@@ -24,7 +24,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from rl_yardstick.agents.common.given_spaces import OriginalSpaces, Translation, translation
+from rl_yardstick.agents.common.given_spaces import OriginalSpaces
 from rl_yardstick.agents.common.model_files import JsonAlgorithm
 from rl_yardstick.agents.common.settings import CheckedConstructor, full_signature
 from rl_yardstick.envs.wrappers import numbered
@@ -60,18 +60,10 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
         seed: seeds the agent's generators, its action space and its environments.
         device: not used, as tables live on the CPU.
         supported_action_spaces: classes of the spaces that the agent can act in; None for all.
-
-    Attributes:
-        original_spaces: the spaces of observations and actions, if the agent's own are numbers of
-            their members; else None. A model file keeps them.
-        translation: the bijections by which `predict` and `get_env` use the original spaces, as
-            the environment does that was given; None if that has the agent's own spaces.
     """
 
-    # For agents on tables: classes of observations that they take as they are. They number the
-    # members of other finite spaces.
+    # Of agents on tables, which number other finite spaces: what they observe as it is.
     observed: ClassVar[tuple[str, ...]] = ()
-    _rebuilt = (*JsonAlgorithm._rebuilt, "translation")
 
     __signature__: ClassVar[inspect.Signature]
     hidden_arguments: ClassVar[tuple[str, ...]] = ()  # see `full_signature`
@@ -110,8 +102,6 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
             seed=seed,
             supported_action_spaces=supported_action_spaces,
         )
-        self.original_spaces: tuple[spaces.Space[Any], ...] | None = None
-        self.translation: Translation | None = None
         self.use_spaces_of(env)
         if _init_setup_model:
             self._setup_model()
@@ -120,27 +110,8 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
     def _wrap_env(cls, env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         """As the library; members of finite spaces are numbered, for an agent on tables."""
         if cls.observed and isinstance(env, gym.Env):
-            env = numbered(env, cls.observed)
+            env = numbered(env, cls.observed, ("Discrete",))
         return JsonAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-
-    def use_spaces_of(self, given: Any) -> None:
-        """Let `predict` use the spaces of an environment that was given; None: the original ones.
-
-        Raises:
-            ValueError: if the environment numbers the members of other spaces.
-        """
-        if self.env is not None and self.env.has_attr("original_spaces"):
-            inside = self.env.get_attr("original_spaces")[0]
-            if self.original_spaces not in (None, inside):
-                raise ValueError(f"the agent learnt on {self.original_spaces}, not {inside}")
-            self.original_spaces = inside
-        has_own = isinstance(given, VecEnv) or (
-            isinstance(given, gym.Env) and given.has_wrapper_attr("original_spaces")
-        )
-        self.translation = None
-        if self.original_spaces is not None:
-            found = translation(self.original_spaces, (self.observation_space, self.action_space))
-            self.translation = None if has_own else found
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """As the library; `predict` then uses the spaces of this environment."""
@@ -149,13 +120,9 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
 
     def get_env(self) -> VecEnv | None:
         """The training environments, with the observations and actions that `predict` uses."""
-        if self.env is None or self.translation is None or self.original_spaces is None:
+        if self.env is None or self.translation is None:
             return self.env
         return OriginalSpaces(self.env, self.original_spaces, self.translation)
-
-    def _excluded_save_params(self) -> list[str]:
-        nothing = [] if self.original_spaces is not None else ["original_spaces"]
-        return [*super()._excluded_save_params(), *nothing]
 
     @abstractmethod
     def _choose_actions(self) -> NDArray[Any]:

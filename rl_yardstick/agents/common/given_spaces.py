@@ -19,19 +19,14 @@ Translation = tuple[Bijection | None, Bijection | None]
 
 
 def translation(original: Any, own: tuple[spaces.Space[Any], ...]) -> Translation:
-    """The bijections from original spaces to an agent's own spaces.
-
-    Raises:
-        ValueError: if these are not the original spaces of such an agent.
-    """
+    """The bijections from original spaces to an agent's own; ValueError if there are none."""
     if not (isinstance(original, tuple) and len(original) == len(own)):
         raise ValueError(f"the original spaces are not of observations and actions: {original}")
-    found = []
-    for space, numbers in zip(original, own, strict=True):
-        found.append(None if space == numbers else Bijection(space))
-        if found[-1] is not None and found[-1].numbers_space.n != getattr(numbers, "n", None):
-            raise ValueError(f"the agent has {numbers}, which does not number {space}")
-    return found[0], found[1]
+    pairs = [*zip(original, own, strict=True)]
+    seen, done = (None if space == numbers else Bijection(space) for space, numbers in pairs)
+    if any(b and b.numbers_space != space for b, space in zip((seen, done), own, strict=True)):
+        raise ValueError(f"the agent's spaces {own} do not number those of {original}")
+    return seen, done
 
 
 def in_given_spaces(predict: Predict) -> Predict:
@@ -63,9 +58,7 @@ def original_actions(done: Bijection, numbers: Any) -> Any:
 class OriginalSpaces(VecEnvWrapper):
     """The environments of an agent with their original observations and actions."""
 
-    def __init__(
-        self, venv: VecEnv, original: tuple[spaces.Space[Any], ...], translated: Translation
-    ) -> None:
+    def __init__(self, venv: VecEnv, original: Any, translated: Translation) -> None:
         super().__init__(venv, *original)
         self.seen, self.done = translated
 

@@ -7,7 +7,6 @@ import json
 import re
 import warnings
 import zipfile
-from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -31,7 +30,9 @@ from stable_baselines3.common.utils import (
     check_for_correct_spaces,
     get_system_info,
 )
+from stable_baselines3.common.vec_env import VecEnv
 
+from rl_yardstick.agents.common.given_spaces import Translation, translation
 from rl_yardstick.agents.common.schedules import ExponentialSchedule
 from rl_yardstick.safe_files.files import (
     MAX_ARCHIVE_BYTES,
@@ -211,14 +212,39 @@ MOST_ENVS = 100_000
 
 
 class JsonAlgorithm(BaseAlgorithm):
-    """An algorithm whose zip contains JSON instead of the library's pickles."""
+    """An algorithm whose zip contains JSON instead of the library's pickles.
 
+    Attributes:
+        original_spaces: the spaces that the agent's own ones number; None if these are as given.
+        translation: the bijections by which `predict` and `get_env` use the original spaces, as
+            the environment does that was given; None if that has the agent's own spaces.
+    """
+
+    original_spaces: Any = None
+    translation: Translation | None = None
     # `_setup_model` rebuilds these, or they belong to one process.
-    _rebuilt: ClassVar[tuple[str, ...]] = ("lr_schedule", "policy_class", "start_time")
+    _rebuilt: ClassVar[tuple[str, ...]] = (
+        "lr_schedule",
+        "policy_class",
+        "start_time",
+        "translation",
+    )
 
-    @abstractmethod
     def use_spaces_of(self, given: Any) -> None:
-        """Let `predict` use the spaces of an environment that was given, or None."""
+        """Let `predict` use the spaces of an environment that was given; None: the original ones.
+
+        Raises:
+            ValueError: if the environment numbers the members of other spaces.
+        """
+        name, own = "original_spaces", (self.observation_space, self.action_space)
+        if self.env is not None and self.env.has_attr(name):
+            inside = self.env.get_attr(name)[0]
+            if self.original_spaces not in (None, inside):
+                raise ValueError(f"the agent learnt on {self.original_spaces}, not {inside}")
+            self.original_spaces = inside
+        found = None if self.original_spaces is None else translation(self.original_spaces, own)
+        is_numbered = hasattr(given, "has_wrapper_attr") and given.has_wrapper_attr(name)
+        self.translation = None if isinstance(given, VecEnv) or is_numbered else found
 
     def save(
         self,

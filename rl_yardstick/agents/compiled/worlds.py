@@ -28,7 +28,6 @@ from rl_yardstick.envs.wrappers import (
     DiscretizeObservation,
     FlattenToDiscrete,
     IdleActionMasks,
-    NumberedSpaces,
     OneHotObservation,
     ScaleReward,
     TerminationReward,
@@ -344,7 +343,7 @@ COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
 CART_POLE_WRAPPERS = {DiscretizeObservation, *COMMON_WRAPPERS}
 MODEL_WRAPPERS = {
     *COMMON_WRAPPERS,
-    *(ActionMasks, IdleActionMasks, NumberedSpaces),
+    *(ActionMasks, IdleActionMasks),
     *(ClipReward, FlattenToDiscrete, OneHotObservation, ScaleReward, TerminationReward),
 }
 
