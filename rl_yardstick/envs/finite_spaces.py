@@ -161,18 +161,19 @@ def _parts(space: Any) -> Iterable[Space]:
     return space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
 
 
-def _ranges(space: Space) -> Iterator[tuple[int, int]]:
+def _ranges(space: Any) -> Iterator[tuple[int, int]]:
     """The number of values of each digit, and the first of them."""
-    if isinstance(space, spaces.Dict | spaces.Tuple):
+    kind = type(space)  # a model file holds no subclass
+    if kind in {spaces.Dict, spaces.Tuple}:
         for part in _parts(space):
             yield from _ranges(part)
-    elif isinstance(space, spaces.Discrete):
+    elif kind is spaces.Discrete:
         yield int(space.n), int(space.start)
-    elif isinstance(space, spaces.MultiDiscrete):
+    elif kind is spaces.MultiDiscrete:
         yield from zip(space.nvec.ravel().tolist(), space.start.ravel().tolist(), strict=True)
-    elif isinstance(space, spaces.MultiBinary) and math.prod(space.shape) < 63:
+    elif kind is spaces.MultiBinary and math.prod(space.shape) < 63:
         yield from [(2, 0)] * math.prod(space.shape)
-    elif isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.integer):
+    elif kind is spaces.Box and np.issubdtype(space.dtype, np.integer):
         bounds = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)
         yield from ((high - low + 1, low) for low, high in bounds)
     else:

@@ -5,6 +5,7 @@ import math
 from unittest.mock import patch
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -16,6 +17,7 @@ from rl_yardstick.pipeline.components import constructor_parameters
 from tests.agents.hand_fed import Spaces
 
 DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))
+FROM_ONE = spaces.MultiDiscrete([2, 2], start=[1, 0])
 PLANNING = ["value_iteration", "policy_iteration", "optimal"]
 TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
 TILED = [name for name, entry in ALGORITHMS.items() if entry.family == "linear"]
@@ -50,7 +52,7 @@ def test_every_name_stands_for_an_algorithm_of_its_own():
         # Which tells of masks.
         ("Warehouse-v0", [*TABULAR, *TILED, *NETWORKS, "ppo_mask", *PLANNING, "random"]),
         ("MountainCarContinuous-v0", [*CONTINUOUS, "random"]),
-        ("Blackjack-v1", []),
+        ("Blackjack-v1", [*TABULAR, *TILED, *PLANNING, "random"]),
     ],
 )
 def test_which_agents_fit(env_id, names):
@@ -74,10 +76,22 @@ MISFITS = [  # agent, observations, actions, and why it does not fit
     ("qlearning", DISCRETE, DISCRETE, ""),
     ("angle", BOX, spaces.Discrete(2), ""),
     ("td3", BOX, DISCRETE, "it acts in Box spaces, not Discrete(4)"),
-    ("sarsa", spaces.Discrete(4, start=1), DISCRETE,
-     "it needs Discrete spaces that start at 0, not Discrete(4, start=1)"),
-    ("random", spaces.Tuple([DISCRETE]), DISCRETE,
+    ("sarsa", spaces.Discrete(4, start=1), spaces.MultiBinary(3), ""),
+    ("random", spaces.Tuple([DISCRETE]), DISCRETE, ""),
+    ("ppo", spaces.Tuple([DISCRETE]), DISCRETE,
      f"it observes {ANY} or Dict spaces, not Tuple(Discrete(4))"),
+    ("optimal", spaces.Box(0, 9, (9,), np.uint8), spaces.Discrete(2),
+     "it observes Discrete spaces, not Box(0, 9, (9,), uint8)"
+     " (a table of 1e+09 x 2 needs 16 GB)"),
+    ("qlearning", spaces.Box(0, 255, (84, 84, 3), np.uint8), DISCRETE,
+     "it observes Discrete spaces, not Box(0, 255, (84, 84, 3), uint8)"),
+    ("dqn", spaces.Discrete(4, start=1), DISCRETE,
+     "it needs Discrete spaces that start at 0, not Discrete(4, start=1)"),
+    ("ppo", BOX, FROM_ONE, "it needs Discrete spaces that start at 0, not "
+     "MultiDiscrete([2 2], start=[1 0])"),
+    ("a2c", spaces.Dict(at=BOX, to=FROM_ONE), DISCRETE, "it needs Discrete spaces that start at 0, "
+     "not Dict('at': Box(-1.0, 1.0, (4,), float32), 'to': MultiDiscrete([2 2], start=[1 0])): "
+     "shift it by Gymnasium's TransformObservation"),
     ("angle", spaces.Box(-1, 1, (2,)), DISCRETE,
      "it needs observations of shape (4,), not (2,)"),
 ]  # fmt: skip

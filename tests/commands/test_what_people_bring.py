@@ -1,5 +1,6 @@
 """What people bring works, or one line says why: a command for each case, as a user types it."""
 
+import itertools
 import json
 import os
 import shlex
@@ -7,12 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import optuna
 import pytest
 import yaml
 from optuna.storages.journal import JournalFileBackend, JournalStorage
 
-from rl_yardstick.agents import ALGORITHMS
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
 
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[2]
 FLAT = "rl_yardstick.envs.wrappers.FlattenToDiscrete"
@@ -50,15 +53,93 @@ def test_what_is_odd_is_said_once(train, own_folder, env, algo, said):
     assert said in json.loads(record.read_text())["notes"][0]
 
 
-@pytest.mark.parametrize("env", ["FromOne", "Pair", "Many", "Named", "Vector"])
-def test_a_wrapper_of_ours_fits_and_is_named_to_be_typed(train, env):
-    code, _, err = train(env)
+def test_a_wrapper_of_ours_fits_and_is_named_to_be_typed(train):
+    code, _, err = train("Vector")
     assert (code, err.count("\n")) == (2, 1)
-    assert (BINS if env == "Vector" else FLAT) in err
-    code, out, err = train(env, *shlex.split(err.partition("add ")[2]))
+    assert BINS in err
+    code, out, err = train("Vector", *shlex.split(err.partition("add ")[2]))
     assert (code, err) == (0, ""), err
     assert "return -4 " in out
     assert "note:" not in out
+
+
+NUMBERED = {
+    "FromOne": "observations: Discrete(5, start=1) as 5 rows",
+    "Pair": "observations: Tuple(Discrete(5), Discrete(2)) as 10 rows",
+    "Many": "observations: MultiDiscrete([5 2]) as 10 rows",
+    "Named": "observations: Dict(at: Discrete(5), on: Discrete(2)) as 10 rows",
+}
+
+
+@pytest.mark.parametrize("env", NUMBERED)
+def test_finite_spaces_are_numbered(train, env):
+    code, out, err = train(env)
+    assert (code, err) == (0, ""), err
+    assert out.count(NUMBERED[env]) == 1
+    assert "return -4 " in out
+    code, out, err = train(env, algo="ppo")
+    if env in ("FromOne", "Pair"):
+        assert (code, err.count("\n")) == (2, 1)
+        assert f"add -params env_wrapper:{FLAT}" in err
+
+
+TUTORIAL = """
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+
+class GridWorld(gym.Env):
+    \"\"\"Walk to a target; both places are drawn anew in each episode, and both are seen.\"\"\"
+
+    moves = ([1, 0], [0, 1], [-1, 0], [0, -1])
+
+    def __init__(self, size=5):
+        self.size, place = size, spaces.Box(0, size - 1, (2,), dtype=int)
+        self.observation_space = spaces.Dict({"agent": place, "target": place})
+        self.action_space = spaces.Discrete(4)
+
+    def seen(self):
+        return {"agent": self.agent.copy(), "target": self.target.copy()}
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        draw = self.np_random.integers
+        self.agent, self.target = draw(0, self.size, 2), draw(0, self.size, 2)
+        while np.array_equal(self.target, self.agent):
+            self.target = draw(0, self.size, 2)
+        return self.seen(), {}
+
+    def step(self, action):
+        self.agent = np.clip(self.agent + self.moves[action], 0, self.size - 1)
+        arrived = np.array_equal(self.agent, self.target)
+        return self.seen(), int(arrived), arrived, False, {}
+
+
+gym.register("tutorial/GridWorld-v0", GridWorld)
+"""
+
+
+def test_the_grid_world_of_gymnasium_is_solved(type_in_own_folder, own_folder):
+    """Its zip plays in plain Stable-Baselines3, from every start to every target."""
+    (own_folder / "tutorial.py").write_text(TUTORIAL)
+    own = ("--gym-packages", "tutorial", "--env", "tutorial/GridWorld-v0", "--algo", "qlearning")
+    code, out, err = type_in_own_folder("train.py", *own, "-n", "40000", "--seed", "0")
+    assert (code, err) == (0, ""), err
+    assert "observations: Dict(agent: Box(2), target: Box(2)) as 625 rows" in out
+    (path,) = own_folder.glob("logs/qlearning/*/tutorial-GridWorld-v0.zip")
+    code, out, err = type_in_own_folder("enjoy.py", *own, "--render", "none", "--n-episodes", "5")
+    assert (code, err) == (0, ""), err
+    assert "return 1 (sampled, 5 episodes)" in out
+    agent, env = load_algorithm("qlearning").load(path), gym.make("tutorial/GridWorld-v0").unwrapped
+    places = [np.array(place) for place in np.ndindex(5, 5)]
+    for start, target in itertools.permutations(places, 2):
+        env.agent, env.target = start, target
+        seen, steps, arrived = env.seen(), 0, False
+        while not arrived:
+            seen, _, arrived, *_ = env.step(agent.predict(seen, deterministic=True)[0])
+            steps += 1
+            assert steps <= 1000
 
 
 @pytest.mark.parametrize(("fault", "said"), STRANGE["tables"].items())

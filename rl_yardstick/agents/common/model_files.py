@@ -236,15 +236,17 @@ class JsonAlgorithm(BaseAlgorithm):
         Raises:
             ValueError: if the environment numbers the members of other spaces.
         """
-        name, own = "original_spaces", (self.observation_space, self.action_space)
+        name = "original_spaces"
         if self.env is not None and self.env.has_attr(name):
             inside = self.env.get_attr(name)[0]
             if self.original_spaces not in (None, inside):
                 raise ValueError(f"the agent learnt on {self.original_spaces}, not {inside}")
             self.original_spaces = inside
-        found = None if self.original_spaces is None else translation(self.original_spaces, own)
-        is_numbered = hasattr(given, "has_wrapper_attr") and given.has_wrapper_attr(name)
-        self.translation = None if isinstance(given, VecEnv) or is_numbered else found
+        has_own = hasattr(given, "has_wrapper_attr") and given.has_wrapper_attr(name)
+        self.translation = None
+        if self.original_spaces is not None and not (has_own or isinstance(given, VecEnv)):
+            own = self.observation_space, self.action_space
+            self.translation = translation(self.original_spaces, own)
 
     def save(
         self,
