@@ -11,6 +11,8 @@ import math
 import textwrap
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 import numpy as np
@@ -46,21 +48,30 @@ class Bijection:
 
     def __init__(self, space: Space) -> None:
         self.space = space
-        ranges, n = list(_ranges(space)), 1
-        steps = []
-        for size, first in reversed(ranges):
+        leaves = list(_leaves(space))
+        self._paths = [path for path, _ in leaves]
+        self._ranges = [ends for _, leaf in leaves for ends in _ranges(leaf)]
+        steps, n = list[int](), 1
+        for size, first in reversed(self._ranges):
             steps.append(n)
-            n *= size  # an image has thousands of digits
+            n *= size
             if not 0 < n < _BEYOND or not -_BEYOND <= first < _BEYOND - size:
                 raise ValueError(f"{describe(space)} has too many members")
-        self.numbers_space, self._ranges = spaces.Discrete(n), ranges
-        rows = [(*ends, step) for ends, step in zip(ranges, steps[::-1], strict=True)]
+        self.numbers_space = spaces.Discrete(n)
+        rows = [(*ends, step) for ends, step in zip(self._ranges, reversed(steps), strict=True)]
         self._digits = np.array(rows, np.int64).reshape(len(rows), 3)
+
+    def _values(self, members: Any) -> list[Any]:
+        """What a member or a batch holds for each space that has no parts."""
+        try:
+            return [reduce(getitem, path, members) for path in self._paths]
+        except (LookupError, TypeError):
+            raise _not_in(self.space, members) from None
 
     def number(self, member: Any) -> int:
         """The number of one member; ValueError if it is not in the space."""
         index, digits = 0, list[Any]()
-        for _, value in _leaves(self.space, member):
+        for value in self._values(member):
             digits += [value] if isinstance(value, int) else np.ravel(value).tolist()
         if len(digits) != len(self._ranges):
             raise _not_in(self.space, member)
@@ -77,7 +88,7 @@ class Bijection:
         An array, or a list of members, holds the digits of each member in a row.
         """
         in_parts = isinstance(batch, dict | tuple)
-        parts = [value for _, value in _leaves(self.space, batch)] if in_parts else [batch]
+        parts = self._values(batch) if in_parts else [batch]
         digits = np.concatenate([np.reshape(part, (len(part), -1)) for part in parts], axis=1)
         if digits.shape[1] != len(self._ranges):
             raise _not_in(self.space, digits[0].tolist())
@@ -101,11 +112,10 @@ class Bijection:
 
     def is_batch(self, members: Any) -> bool:
         """Whether the argument is a batch of members, and not one member."""
-        if isinstance(members, list):
-            return True
-        for part, value in _leaves(self.space, members):
-            return np.ndim(value) > len(part.shape or ())
-        return False
+        if isinstance(members, list) or not self._paths:
+            return isinstance(members, list)
+        leaf = reduce(getitem, self._paths[0], self.space)
+        return np.ndim(self._values(members)[0]) > len(leaf.shape or ())
 
 
 def bijection_of(space: Space, kept: Iterable[str] = ("Discrete",)) -> Bijection | None:
@@ -123,9 +133,7 @@ def bijection_of(space: Space, kept: Iterable[str] = ("Discrete",)) -> Bijection
 
 def counts_from_zero(space: Space) -> bool:
     """Whether each Discrete and MultiDiscrete in a space starts at 0, as one-hot encodings need."""
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        return all(map(counts_from_zero, _parts(space)))
-    return not np.any(getattr(space, "start", 0))
+    return not any(np.any(getattr(leaf, "start", 0)) for _, leaf in _leaves(space))
 
 
 def table_size(observations: Space, actions: Space) -> str:
@@ -157,17 +165,20 @@ def _not_in(space: Space, member: Any) -> ValueError:
     return ValueError(f"{textwrap.shorten(str(member), 80)} is not in {describe(space)}")
 
 
-def _parts(space: Any) -> Iterable[Space]:
-    return space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
+def _leaves(space: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """The spaces that have no parts, each with the keys that lead to it."""
+    if type(space) not in {spaces.Dict, spaces.Tuple}:
+        yield path, space
+        return
+    is_dict = isinstance(space, spaces.Dict)
+    for key, part in space.spaces.items() if is_dict else enumerate(space.spaces):
+        yield from _leaves(part, (*path, key))
 
 
 def _ranges(space: Any) -> Iterator[tuple[int, int]]:
     """The number of values of each digit, and the first of them."""
     kind = type(space)  # a model file holds no subclass
-    if kind in {spaces.Dict, spaces.Tuple}:
-        for part in _parts(space):
-            yield from _ranges(part)
-    elif kind is spaces.Discrete:
+    if kind is spaces.Discrete:
         yield int(space.n), int(space.start)
     elif kind is spaces.MultiDiscrete:
         yield from zip(space.nvec.ravel().tolist(), space.start.ravel().tolist(), strict=True)
@@ -178,20 +189,6 @@ def _ranges(space: Any) -> Iterator[tuple[int, int]]:
         yield from ((high - low + 1, low) for low, high in bounds)
     else:
         raise ValueError(f"{space} is not finite, or too large")
-
-
-def _leaves(space: Space, member: Any) -> Iterator[tuple[Space, Any]]:
-    """The spaces that have no parts, with their values in a member or a batch."""
-    if not isinstance(space, spaces.Dict | spaces.Tuple):
-        yield space, member
-        return
-    keys = list(space.spaces) if isinstance(space, spaces.Dict) else range(len(space.spaces))
-    try:
-        values = [member[key] for key in keys]
-    except (LookupError, TypeError):
-        raise _not_in(space, member) from None
-    for part, value in zip(_parts(space), values, strict=True):
-        yield from _leaves(part, value)
 
 
 def _built(space: Space, digits: Iterator[Any], before: tuple[int, ...]) -> Any:

@@ -72,6 +72,7 @@ def test_which_agents_fit(env_id, names):
 
 
 ANY = "Box or Discrete or MultiDiscrete or MultiBinary"
+NOT_ZERO = "it needs Discrete spaces that start at 0, not"
 MISFITS = [  # agent, observations, actions, and why it does not fit
     ("qlearning", DISCRETE, DISCRETE, ""),
     ("angle", BOX, spaces.Discrete(2), ""),
@@ -81,17 +82,13 @@ MISFITS = [  # agent, observations, actions, and why it does not fit
     ("ppo", spaces.Tuple([DISCRETE]), DISCRETE,
      f"it observes {ANY} or Dict spaces, not Tuple(Discrete(4))"),
     ("optimal", spaces.Box(0, 9, (9,), np.uint8), spaces.Discrete(2),
-     "it observes Discrete spaces, not Box(0, 9, (9,), uint8)"
-     " (a table of 1e+09 x 2 needs 16 GB)"),
+     "it observes Discrete spaces, not Box(0, 9, (9,), uint8) (a table of 1e+09 x 2 needs 16 GB)"),
     ("qlearning", spaces.Box(0, 255, (84, 84, 3), np.uint8), DISCRETE,
      "it observes Discrete spaces, not Box(0, 255, (84, 84, 3), uint8)"),
-    ("dqn", spaces.Discrete(4, start=1), DISCRETE,
-     "it needs Discrete spaces that start at 0, not Discrete(4, start=1)"),
-    ("ppo", BOX, FROM_ONE, "it needs Discrete spaces that start at 0, not "
-     "MultiDiscrete([2 2], start=[1 0])"),
-    ("a2c", spaces.Dict(at=BOX, to=FROM_ONE), DISCRETE, "it needs Discrete spaces that start at 0, "
-     "not Dict('at': Box(-1.0, 1.0, (4,), float32), 'to': MultiDiscrete([2 2], start=[1 0])): "
-     "shift it by Gymnasium's TransformObservation"),
+    ("dqn", spaces.Discrete(4, start=1), DISCRETE, f"{NOT_ZERO} Discrete(4, start=1)"),
+    ("ppo", BOX, FROM_ONE, f"{NOT_ZERO} MultiDiscrete([2 2], start=[1 0])"),
+    ("a2c", spaces.Dict(at=BOX, to=FROM_ONE), DISCRETE,
+     f"{NOT_ZERO} {spaces.Dict(at=BOX, to=FROM_ONE)}: shift it by Gymnasium's TransformObservation"),
     ("angle", spaces.Box(-1, 1, (2,)), DISCRETE,
      "it needs observations of shape (4,), not (2,)"),
 ]  # fmt: skip

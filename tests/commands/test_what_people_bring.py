@@ -77,8 +77,8 @@ def test_finite_spaces_are_numbered(train, env):
     assert (code, err) == (0, ""), err
     assert out.count(NUMBERED[env]) == 1
     assert "return -4 " in out
-    code, out, err = train(env, algo="ppo")
-    if env in ("FromOne", "Pair"):
+    if env in ("FromOne", "Pair"):  # which networks cannot take
+        code, _, err = train(env, algo="ppo")
         assert (code, err.count("\n")) == (2, 1)
         assert f"add -params env_wrapper:{FLAT}" in err
 
@@ -124,7 +124,7 @@ def test_the_grid_world_of_gymnasium_is_solved(type_in_own_folder, own_folder):
     """Its zip plays in plain Stable-Baselines3, from every start to every target."""
     (own_folder / "tutorial.py").write_text(TUTORIAL)
     own = ("--gym-packages", "tutorial", "--env", "tutorial/GridWorld-v0", "--algo", "qlearning")
-    code, out, err = type_in_own_folder("train.py", *own, "-n", "40000", "--seed", "0")
+    code, out, err = type_in_own_folder("train.py", *own, "-n", "25000", "--seed", "0")
     assert (code, err) == (0, ""), err
     assert "observations: Dict(agent: Box(2), target: Box(2)) as 625 rows" in out
     (path,) = own_folder.glob("logs/qlearning/*/tutorial-GridWorld-v0.zip")
@@ -139,7 +139,7 @@ def test_the_grid_world_of_gymnasium_is_solved(type_in_own_folder, own_folder):
         while not arrived:
             seen, _, arrived, *_ = env.step(agent.predict(seen, deterministic=True)[0])
             steps += 1
-            assert steps <= 1000
+            assert steps < 1000
 
 
 @pytest.mark.parametrize(("fault", "said"), STRANGE["tables"].items())
