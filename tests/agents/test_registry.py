@@ -72,6 +72,7 @@ def test_which_agents_fit(env_id, names):
 
 
 ANY = "Box or Discrete or MultiDiscrete or MultiBinary"
+MIXED = spaces.Dict(at=BOX, to=FROM_ONE)
 NOT_ZERO = "it needs Discrete spaces that start at 0, not"
 MISFITS = [  # agent, observations, actions, and why it does not fit
     ("qlearning", DISCRETE, DISCRETE, ""),
@@ -87,8 +88,7 @@ MISFITS = [  # agent, observations, actions, and why it does not fit
      "it observes Discrete spaces, not Box(0, 255, (84, 84, 3), uint8)"),
     ("dqn", spaces.Discrete(4, start=1), DISCRETE, f"{NOT_ZERO} Discrete(4, start=1)"),
     ("ppo", BOX, FROM_ONE, f"{NOT_ZERO} MultiDiscrete([2 2], start=[1 0])"),
-    ("a2c", spaces.Dict(at=BOX, to=FROM_ONE), DISCRETE,
-     f"{NOT_ZERO} {spaces.Dict(at=BOX, to=FROM_ONE)}: shift it by Gymnasium's TransformObservation"),
+    ("a2c", MIXED, DISCRETE, f"{NOT_ZERO} {MIXED}: shift it by Gymnasium's TransformObservation"),
     ("angle", spaces.Box(-1, 1, (2,)), DISCRETE,
      "it needs observations of shape (4,), not (2,)"),
 ]  # fmt: skip

@@ -124,7 +124,7 @@ def test_the_grid_world_of_gymnasium_is_solved(type_in_own_folder, own_folder):
     """Its zip plays in plain Stable-Baselines3, from every start to every target."""
     (own_folder / "tutorial.py").write_text(TUTORIAL)
     own = ("--gym-packages", "tutorial", "--env", "tutorial/GridWorld-v0", "--algo", "qlearning")
-    code, out, err = type_in_own_folder("train.py", *own, "-n", "25000", "--seed", "0")
+    code, out, err = type_in_own_folder("train.py", *own, "-n", "20000", "--seed", "0")
     assert (code, err) == (0, ""), err
     assert "observations: Dict(agent: Box(2), target: Box(2)) as 625 rows" in out
     (path,) = own_folder.glob("logs/qlearning/*/tutorial-GridWorld-v0.zip")
