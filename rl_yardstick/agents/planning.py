@@ -76,7 +76,6 @@ class ReferenceAgent(OnlineAlgorithm):
 
     @in_given_spaces
     def predict(self, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """The policy's actions, as the library's `predict`."""
         return super().predict(*args, **kwargs)
 
 
