@@ -46,7 +46,7 @@ class Bijection:
         ValueError: if the space is not finite, or has 2 ** 63 members or more.
     """
 
-    def __init__(self, space: Space) -> None:
+    def __init__(self, space: Any) -> None:
         self.space = space
         leaves = list(_leaves(space))
         self._paths = [path for path, _ in leaves]

@@ -18,8 +18,8 @@ from rl_yardstick.agents.tabular.q_learning_and_sarsa import SARSA, QLearning
 from rl_yardstick.envs.finite_spaces import Bijection, describe
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.envs.wrappers import FlattenToDiscrete
-from rl_yardstick.safe_files.models import UnsafeFileError
 
+same = np.testing.assert_equal
 BOX, PAIR = spaces.Box(-1, 2, (2,), np.int64), spaces.MultiDiscrete([2, 2], start=[0, -3])
 # Of observations and of actions; the first have 16 members or more, the second four.
 SPACES = {
@@ -59,19 +59,6 @@ def stacked(parts):
     return np.array(parts)
 
 
-def alike(one, other):
-    np.testing.assert_equal(one, other)
-    return True
-
-
-def digits(member):
-    """The numbers in a member, in the order of its parts."""
-    parts = member.values() if isinstance(member, dict) else member
-    if not isinstance(member, dict | tuple):
-        return np.ravel(member).tolist()
-    return [digit for part in parts for digit in digits(part)]
-
-
 class Lake(gym.Wrapper):
     """FrozenLake whose states and actions are members of other spaces."""
 
@@ -79,6 +66,7 @@ class Lake(gym.Wrapper):
         super().__init__(gym.make("FrozenLake-v1").unwrapped)
         self.observation_space, self.action_space = observations, actions
         self.seen, self.done = members_of(observations), members_of(actions)
+        self.number = Bijection(actions).number
 
     def reset(self, **kwargs):
         state, info = self.env.reset(**kwargs)
@@ -86,14 +74,8 @@ class Lake(gym.Wrapper):
 
     def step(self, action):
         assert self.action_space.contains(action)
-        state, *rest = self.env.step([digits(one) for one in self.done].index(digits(action)))
+        state, *rest = self.env.step(self.number(action))
         return self.seen[state], *rest
-
-
-def flat(name):
-    """The same, flattened by hand."""
-    sizes = [len(members_of(space)) for space in SPACES[name]]
-    return Lake(*map(spaces.Discrete, sizes))
 
 
 @pytest.mark.parametrize("name", SPACES)
@@ -107,33 +89,32 @@ def test_each_member_has_a_number_and_comes_back(name):
         for number, member in enumerate(members):
             back = numbering.member(number)
             assert space.contains(back)
-            assert alike(back, member)
+            same(back, member)
             assert not numbering.is_batch(back)
-        assert alike(numbering.members(range(n)), stacked(members))
+        same(numbering.members(range(n)), stacked(members))
         assert numbering.is_batch(stacked(members))
 
 
 @pytest.mark.parametrize(("name", "algorithm"), [*zip(SPACES, [QLearning, SARSA] * 4, strict=True)])
 def test_the_table_is_that_of_an_environment_flattened_by_hand(name, algorithm, tmp_path):
-    settings = {"seed": 3, "initial_q_std": 0.1}
-    env = Lake(*SPACES[name])
-    agent, other = (algorithm(env=one, **settings).learn(800) for one in (env, flat(name)))
+    settings, env = {"seed": 3, "initial_q_std": 0.1}, Lake(*SPACES[name])
+    by_hand = Lake(*(spaces.Discrete(len(members)) for members in (env.seen, env.done)))
+    agent, other = (algorithm(env=one, **settings).learn(800) for one in (env, by_hand))
     assert agent.policy.visit_counts.sum() == 800
-    assert alike(agent.policy.q_tables.numpy(), other.policy.q_tables.numpy())
+    same(agent.policy.q_tables.numpy(), other.policy.q_tables.numpy())
     agent.save(tmp_path / "agent")
     loaded = algorithm.load(tmp_path / "agent")
     numbers, _ = other.predict(np.arange(16), deterministic=True)
     for state, number in enumerate(numbers):
         action, _ = loaded.predict(env.seen[state], deterministic=True)
-        assert alike(action, env.done[number])
+        same(action, env.done[number])
         assert env.action_space.contains(action)
     many, _ = loaded.predict(stacked(env.seen[:16]), deterministic=True)
-    assert alike(list(many), [env.done[number] for number in numbers])
+    same(list(many), [env.done[number] for number in numbers])
     # The exact values of both policies, by the model of FrozenLake.
-    chosen = np.array([Bijection(env.action_space).number(action) for action in many])
-    model = transition_model(gym.make("FrozenLake-v1"))
-    worths = [mdp.policy_return(model, policy, 100).expected_return for policy in (chosen, numbers)]
-    assert worths[0] == worths[1]
+    model, chosen = transition_model(gym.make("FrozenLake-v1")), np.array([*map(env.number, many)])
+    first, second = (mdp.policy_return(model, policy, 100) for policy in (chosen, numbers))
+    assert first.expected_return == second.expected_return
 
 
 @pytest.mark.parametrize("name", ["start", "dict", "many"])
@@ -153,19 +134,13 @@ def test_predict_takes_what_the_given_environment_shows(name, tmp_path):
     assert env.action_space.contains(loaded.predict(env.reset()[0], deterministic=True)[0])
 
 
-FINITE = st.one_of(
-    st.builds(spaces.Discrete, st.integers(1, 4), start=st.integers(-9, 9)),
-    st.builds(lambda n, start: spaces.MultiDiscrete([n, 2], start=[start, 0]),
-              st.integers(1, 3), st.integers(-5, 5)),
-    st.builds(spaces.MultiBinary, st.integers(1, 3)),
-    st.builds(lambda low, more: spaces.Box(low, low + more, (2,), np.int16),
-              st.integers(-100, 100), st.integers(0, 3)),
-)  # fmt: skip
 NESTED = st.recursive(
-    FINITE,
-    lambda part: st.one_of(
-        st.lists(part, min_size=1, max_size=3).map(spaces.Tuple),
-        st.dictionaries(st.text("abc", min_size=1), part, min_size=1, max_size=3).map(spaces.Dict),
+    st.builds(spaces.Discrete, st.integers(1, 4), start=st.integers(-9, 9))
+    | st.builds(lambda low: spaces.Box(low, low + 2, (2,), np.int16), st.integers(-100, 100))
+    | st.sampled_from([PAIR, spaces.MultiBinary(2)]),
+    lambda part: (
+        st.lists(part, min_size=1, max_size=3).map(spaces.Tuple)
+        | st.dictionaries(st.text("abc", min_size=1), part, min_size=1, max_size=3).map(spaces.Dict)
     ),
     max_leaves=5,
 )
@@ -178,23 +153,15 @@ def test_members_of_any_nested_space_come_back(space, seed):
     drawn = [space.sample() for _ in range(5)]
     numbers = [numbering.number(member) for member in drawn]
     assert all(0 <= number < numbering.numbers_space.n for number in numbers)
-    assert alike([numbering.member(number) for number in numbers], drawn)
-    assert alike(numbering.members(numbers), stacked(drawn))
+    same([numbering.member(number) for number in numbers], drawn)
+    same(numbering.members(numbers), stacked(drawn))
     assert numbering.numbers(stacked(drawn)).tolist() == numbers
     assert len(describe(space)) <= 80
 
 
-WRONG = [
-    ((13, 10, 2), r"\(13, 10, 2\) is not in Tuple"),
-    ((13, 10), r"\(13, 10\) is not in Tuple"),
-    ((13, 9.5, 0), r"\(13, 9.5, 0\) is not in Tuple"),
-    ((np.array([13]), np.array([11]), np.array([0])), r"\[13, 11, 0\] is not in Tuple"),
-]
-
-
-@pytest.mark.parametrize(("observation", "said"), WRONG)
-def test_observations_of_another_space_are_refused(observation, said):
-    with pytest.raises(ValueError, match=said):
+@pytest.mark.parametrize("observation", [(13, 10, 2), (13, 10), (13, 9.5, 0), ([13], [11], [0])])
+def test_observations_of_another_space_are_refused(observation):
+    with pytest.raises(ValueError, match=r"is not in Tuple\(Discrete\(32\), "):
         QLearning(env="Blackjack-v1").predict(observation)
 
 
@@ -210,16 +177,15 @@ def test_environments_that_do_not_fit_name_the_way_out(tmp_path):
         QLearning.load(tmp_path / "agent", env=Lake(spaces.Discrete(16), spaces.MultiBinary(2)))
 
 
-def test_a_file_with_other_spaces_is_refused(tmp_path):
+@pytest.mark.parametrize("size", ["3", "1000000000000", '{"type": "tuple", "items": [2]}'])
+def test_a_file_with_other_spaces_is_refused(size, tmp_path):
     QLearning(env=Lake(*SPACES["bits"])).save(tmp_path / "agent")
-    for old, new in ((b'"n": {"type": "tuple", "items": [2, 2]}', b'"n": 3'),
-                     (b'"original_spaces": {"type": "tuple"', b'"original_spaces": {"type": "deque"')):  # fmt: skip  # noqa: E501
-        with zipfile.ZipFile(tmp_path / "agent.zip") as whole:
-            members = {name: whole.read(name) for name in whole.namelist()}
-        assert old in members["data"]
-        members["data"] = members["data"].replace(old, new)
-        with zipfile.ZipFile(tmp_path / "other.zip", "w") as other:
-            for name, content in members.items():
-                other.writestr(name, content)
-        with pytest.raises((ValueError, UnsafeFileError), match=r"spaces|damaged"):
-            QLearning.load(tmp_path / "other")
+    with (
+        zipfile.ZipFile(tmp_path / "agent.zip") as whole,
+        zipfile.ZipFile(tmp_path / "other.zip", "w") as other,
+    ):
+        for name in whole.namelist():
+            old = b'{"type": "tuple", "items": [2, 2]}'
+            other.writestr(name, whole.read(name).replace(old, size.encode()))
+    with pytest.raises(ValueError, match=r"do not number|not finite"):
+        QLearning.load(tmp_path / "other")

@@ -84,6 +84,27 @@ class Known(Line):
             self.initial_state_distrib = np.eye(5)[0]
 
 
+class GridWorld(Line):
+    """As in Gymnasium's tutorial, without a fault: both places are drawn, and both are seen."""
+
+    place, action_space = spaces.Box(0, 4, (2,), dtype=int), spaces.Discrete(4)
+    observation_space = spaces.Dict({"agent": place, "target": place})
+
+    def reset(self, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        drawn = self.np_random.choice(25, 2, replace=False)
+        self.agent, self.target = (np.array(divmod(one, 5)) for one in drawn)
+        return self.seen(), {}
+
+    def step(self, action):
+        self.agent = np.clip(self.agent + ([1, 0], [0, 1], [-1, 0], [0, -1])[action], 0, 4)
+        arrived = np.array_equal(self.agent, self.target)
+        return self.seen(), int(arrived), arrived, False, {}
+
+    def seen(self):
+        return {"agent": self.agent.copy(), "target": self.target.copy()}
+
+
 NUMBERS, VECTORS = Line.observation_space, spaces.Box(0, 4, (2,), np.float32)
 PAIR = spaces.Discrete(5), spaces.Discrete(2)
 # The space of observations, and what is seen at a place.
