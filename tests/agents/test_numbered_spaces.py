@@ -1,7 +1,6 @@
 """Agents on tables work with all finite spaces: the same tables, and the original observations."""
 
 import itertools
-import zipfile
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +12,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rl_yardstick import mdp
-from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.tabular.q_learning_and_sarsa import SARSA, QLearning
 from rl_yardstick.envs.finite_spaces import Bijection, describe
 from rl_yardstick.envs.known_models import transition_model
@@ -78,21 +76,22 @@ class Lake(gym.Wrapper):
         return self.seen[state], *rest
 
 
+def check(space, members, numbers):
+    numbering = Bijection(space)
+    assert [*map(numbering.number, members)] == numbers
+    assert numbering.numbers(stacked(members)).tolist() == numbers
+    same([*map(numbering.member, numbers)], members)
+    same(numbering.members(numbers), stacked(members))
+    assert all(map(space.contains, map(numbering.member, numbers)))
+    assert numbering.is_batch(stacked(members)) > any(map(numbering.is_batch, members))
+
+
 @pytest.mark.parametrize("name", SPACES)
 def test_each_member_has_a_number_and_comes_back(name):
     for space in SPACES[name]:
-        numbering, members = Bijection(space), members_of(space)
-        n = len(members)
-        assert numbering.numbers_space == spaces.Discrete(n)
-        assert [numbering.number(member) for member in members] == [*range(n)]
-        assert numbering.numbers(stacked(members)).tolist() == [*range(n)]
-        for number, member in enumerate(members):
-            back = numbering.member(number)
-            assert space.contains(back)
-            same(back, member)
-            assert not numbering.is_batch(back)
-        same(numbering.members(range(n)), stacked(members))
-        assert numbering.is_batch(stacked(members))
+        members = members_of(space)
+        assert Bijection(space).numbers_space == spaces.Discrete(len(members))
+        check(space, members, [*range(len(members))])
 
 
 @pytest.mark.parametrize(("name", "algorithm"), [*zip(SPACES, [QLearning, SARSA] * 4, strict=True)])
@@ -121,9 +120,8 @@ def test_the_table_is_that_of_an_environment_flattened_by_hand(name, algorithm, 
 def test_predict_takes_what_the_given_environment_shows(name, tmp_path):
     env = gym.wrappers.TimeLimit(Lake(*SPACES[name]), 20)
     agent = QLearning(env=env, seed=0).learn(200)
-    around = agent.get_env()
-    assert around.observation_space == SPACES[name][0]
-    for where in (around, env):
+    assert agent.get_env().observation_space == SPACES[name][0]
+    for where in (agent.get_env(), env):
         evaluate_policy(agent, where, 3, warn=False)
     agent.save(tmp_path / "agent")
     for given_env in (env, FlattenToDiscrete(env), DummyVecEnv([lambda: FlattenToDiscrete(env)])):
@@ -148,14 +146,9 @@ NESTED = st.recursive(
 
 @given(NESTED, st.integers(0, 99))
 def test_members_of_any_nested_space_come_back(space, seed):
-    numbering = Bijection(space)
     space.seed(seed)
     drawn = [space.sample() for _ in range(5)]
-    numbers = [numbering.number(member) for member in drawn]
-    assert all(0 <= number < numbering.numbers_space.n for number in numbers)
-    same([numbering.member(number) for number in numbers], drawn)
-    same(numbering.members(numbers), stacked(drawn))
-    assert numbering.numbers(stacked(drawn)).tolist() == numbers
+    check(space, drawn, [*map(Bijection(space).number, drawn)])
     assert len(describe(space)) <= 80
 
 
@@ -169,23 +162,16 @@ def test_environments_that_do_not_fit_name_the_way_out(tmp_path):
     many = DummyVecEnv([lambda: Lake(*SPACES["many"])])
     with pytest.raises(ValueError, match=r"wrap each environment in rl_yardstick.envs.wrappers.Fl"):
         QLearning(env=many)
-    agent = load_algorithm("random")("RandomPolicy", Lake(*SPACES["many"]))
-    assert agent.original_spaces is None  # it takes these spaces as they are
     agent = QLearning(env=Lake(spaces.Discrete(16), spaces.MultiDiscrete([2, 2])))
     agent.save(tmp_path / "agent")
     with pytest.raises(ValueError, match="the agent learnt on"):
         QLearning.load(tmp_path / "agent", env=Lake(spaces.Discrete(16), spaces.MultiBinary(2)))
 
 
-@pytest.mark.parametrize("size", ["3", "1000000000000", '{"type": "tuple", "items": [2]}'])
-def test_a_file_with_other_spaces_is_refused(size, tmp_path):
-    QLearning(env=Lake(*SPACES["bits"])).save(tmp_path / "agent")
-    with (
-        zipfile.ZipFile(tmp_path / "agent.zip") as whole,
-        zipfile.ZipFile(tmp_path / "other.zip", "w") as other,
-    ):
-        for name in whole.namelist():
-            old = b'{"type": "tuple", "items": [2, 2]}'
-            other.writestr(name, whole.read(name).replace(old, size.encode()))
+@pytest.mark.parametrize("space", [spaces.Discrete(3, start=1), spaces.MultiBinary(10**12), BOX, 5])
+def test_a_file_with_other_spaces_is_refused(space, tmp_path):
+    agent = QLearning(env=Lake(spaces.Discrete(16), PAIR))
+    agent.original_spaces = (agent.observation_space, space)
+    agent.save(tmp_path / "agent")
     with pytest.raises(ValueError, match=r"do not number|not finite"):
-        QLearning.load(tmp_path / "other")
+        QLearning.load(tmp_path / "agent")
