@@ -159,9 +159,8 @@ def test_observations_of_another_space_are_refused(observation):
 
 
 def test_environments_that_do_not_fit_name_the_way_out(tmp_path):
-    many = DummyVecEnv([lambda: Lake(*SPACES["many"])])
     with pytest.raises(ValueError, match=r"wrap each environment in rl_yardstick.envs.wrappers.Fl"):
-        QLearning(env=many)
+        QLearning(env=DummyVecEnv([lambda: Lake(*SPACES["many"])]))
     agent = QLearning(env=Lake(spaces.Discrete(16), spaces.MultiDiscrete([2, 2])))
     agent.save(tmp_path / "agent")
     with pytest.raises(ValueError, match="the agent learnt on"):

@@ -84,8 +84,6 @@ MISFITS = [  # agent, observations, actions, and why it does not fit
      f"it observes {ANY} or Dict spaces, not Tuple(Discrete(4))"),
     ("optimal", spaces.Box(0, 9, (9,), np.uint8), spaces.Discrete(2),
      "it observes Discrete spaces, not Box(0, 9, (9,), uint8) (a table of 1e+09 x 2 needs 16 GB)"),
-    ("qlearning", spaces.Box(0, 255, (84, 84, 3), np.uint8), DISCRETE,
-     "it observes Discrete spaces, not Box(0, 255, (84, 84, 3), uint8)"),
     ("dqn", spaces.Discrete(4, start=1), DISCRETE, f"{NOT_ZERO} Discrete(4, start=1)"),
     ("ppo", BOX, FROM_ONE, f"{NOT_ZERO} MultiDiscrete([2 2], start=[1 0])"),
     ("a2c", MIXED, DISCRETE, f"{NOT_ZERO} {MIXED}: shift it by Gymnasium's TransformObservation"),
