@@ -82,7 +82,7 @@ class AlgorithmEntry:
             if not known or (self.numbers_spaces and bijection_of(space, known) is not None):
                 continue
             if type(space).__name__ not in known:
-                size = table_size(space, action_space) if self.numbers_spaces else ""
+                size = table_size(observation_space, action_space) if self.numbers_spaces else ""
                 return f"it {role} {' or '.join(known)} spaces, not {space}{size}"
             # The one-hot encoding of Stable-Baselines3 and every table count from zero.
             if not counts_from_zero(space):
