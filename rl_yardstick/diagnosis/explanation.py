@@ -162,43 +162,29 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
         UserError: where the agent's policy cannot be evaluated in all states, or the environment is
             too large.
     """
-    from rl_yardstick.diagnosis.proposals import proposals
-
     if reason := evaluator.obstacle(agent):
         raise UserError(f"{spec.algo} cannot be explained: {reason}")
     policy = evaluator.policy(agent, deterministic=True)
-    try:
-        split = gap_by_state(evaluator.model, policy, evaluator.horizon)
-    except ValueError as error:
-        raise UserError(f"{spec.algo} on {spec.env_id} cannot be explained: {error}") from error
-    explained = _overview(evaluator, policy, split)
-    if explained.is_optimal:
-        return explained
-    found = Found(evaluator, policy, split, agent, _task(spec, agent, evaluator))
     with closing(make_single_env(spec)) as env:
-        explained = _detailed(explained, found, env)
-    return replace(explained, proposals=proposals(spec, found, explained.parts))
+        return explanation_of_policy(env, evaluator, policy, (spec, agent))
 
 
 def explanation_of_policy(
-    env: gym.Env[Any, Any], evaluator: ExactEvaluator, policy: NDArray[Any]
+    env: gym.Env[Any, Any],
+    evaluator: ExactEvaluator,
+    policy: NDArray[Any],
+    learner: tuple[TrainSpec, BaseAlgorithm] | None = None,
 ) -> Explanation:
-    """As `explanation`, of a policy whose training is not known: without parts and proposals.
+    """As `explanation`, of a policy in a form of `mdp.evaluation`, on the evaluator's environment.
 
-    ``evaluator`` is that of ``env``; the policy has one of the forms of `mdp.evaluation`.
-
-    Raises:
-        ValueError: where horizon times states are too many.
+    Without a ``learner``, a spec and its agent, the explanation has no parts and no proposals.
     """
-    split = gap_by_state(evaluator.model, policy, evaluator.horizon)
-    explained = _overview(evaluator, policy, split)
-    if explained.is_optimal:
-        return explained
-    return _detailed(explained, Found(evaluator, policy, split), env)
-
-
-def _overview(evaluator: ExactEvaluator, policy: NDArray[Any], split: GapByState) -> Explanation:
-    return Explanation(
+    try:
+        split = gap_by_state(evaluator.model, policy, evaluator.horizon)
+    except ValueError as error:
+        what = "this" if learner is None else f"{learner[0].algo} on {learner[0].env_id}"
+        raise UserError(f"{what} cannot be explained: {error}") from error
+    explained = Explanation(
         optimum=split.optimum,
         value=split.value,
         score=evaluator.yardstick.score(split.value),
@@ -206,13 +192,13 @@ def _overview(evaluator: ExactEvaluator, policy: NDArray[Any], split: GapByState
         losses=split.losses,
         n_states=int((split.losses > 0).sum()),
     )
-
-
-def _detailed(explained: Explanation, found: Found, env: gym.Env[Any, Any]) -> Explanation:
-    """The explanation with parts, states, repairs, and the road."""
-    known, task = action_names(env), found.task
-    more = (f"action {action}" for action in range(len(known), found.model.n_actions))
-    names = partial(state_name, env, found.evaluator.layout), (*known, *more)
+    if explained.is_optimal:
+        return explained
+    task = None if learner is None else _task(*learner, evaluator)
+    found = Found(evaluator, None if learner is None else learner[1], policy, split, task)
+    known = action_names(env)
+    more = (f"action {action}" for action in range(len(known), evaluator.model.n_actions))
+    names = partial(state_name, env, evaluator.layout), (*known, *more)
     alike = None if found.groups is None else found.alike(names)
     explained = replace(
         explained,
@@ -226,7 +212,11 @@ def _detailed(explained: Explanation, found: Found, env: gym.Env[Any, Any]) -> E
     )
     if alike is not None or not explained.is_concentrated:
         explained = replace(explained, road=alike or found.road(names))
-    return explained
+    if learner is None:
+        return explained
+    from rl_yardstick.diagnosis.proposals import proposals
+
+    return replace(explained, proposals=proposals(learner[0], found, explained.parts))
 
 
 def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> Task | None:
@@ -262,10 +252,10 @@ class Found:
     def __init__(
         self,
         evaluator: ExactEvaluator,
+        agent: BaseAlgorithm | None,
         policy: NDArray[Any],
         split: GapByState,
-        agent: BaseAlgorithm | None = None,
-        task: Task | None = None,
+        task: Task | None,
     ) -> None:
         self.evaluator, self.split, self.task, self.policy = evaluator, split, task, policy
         self.model, self.horizon = evaluator.model, evaluator.horizon

@@ -1,9 +1,8 @@
 """Reads files with tables as data: arrays, dictionaries and lists of numbers, of unknown origin.
 
-Known are NumPy's files, pickles of protocols 0 to 5, JSON, CSV, and tensors of PyTorch, which are
-read without it. A pickle may hold arrays, dictionaries of any kind whose keys are numbers, texts
-and tuples of them, and objects of any class, as dictionaries of those attributes that can be read:
-no class of the file is looked up, and nothing in it is called.
+A pickle, of protocols 0 to 5, may hold arrays, dictionaries of any kind whose keys are numbers,
+texts and tuples of them, and objects of any class, as dictionaries of those attributes that can be
+read: no class of the file is looked up, and nothing in it is called.
 """
 
 from __future__ import annotations
@@ -15,27 +14,18 @@ import math
 import pickle
 import re
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rl_yardstick.safe_files import files
 from rl_yardstick.safe_files.arrays import ARRAYS
-from rl_yardstick.safe_files.files import (
-    MAX_ARCHIVE_BYTES,
-    Budget,
-    Source,
-    UnsafeFileError,
-    content_of,
-    read_members,
-    shown,
-)
+from rl_yardstick.safe_files.files import Budget, Source, UnsafeFileError
 from rl_yardstick.safe_files.pickles import (
     DICTIONARY,
     INSTRUCTIONS,
-    PERSISTENT_ID,
     Build,
     Made,
     Maker,
@@ -48,12 +38,12 @@ _TIMES_DENSE, _MOST_DENSE = 300, 1 << 30
 _BYTES_PER_CELL = 200  # of a CSV file
 _END_OF_KEYS = (1 << 61) - 1  # larger integers are not their own hash
 _NUMBER = re.compile(r"\d|nan|inf", re.IGNORECASE)
-_STATES = {"", "s", "state", "states", "obs", "observation", "index"}
-_ACTIONS = {"a", "action", "actions"}
+_OLD = frozenset(["INT", "LONG", "FLOAT", "UNICODE", "LIST", "DICT", "PUT", "GET"])
+_STATES, _ACTIONS = ("", "s", "state", "states", "obs", "observation"), ("a", "action", "actions")
 
 
 def read_table_file(source: Source) -> Any:
-    """Read a file that holds a table, by its content; the suffix decides between texts alone.
+    """Read a file that holds a table, by its content; the suffix tells JSON and CSV apart.
 
     Returns:
         arrays, and dictionaries, lists and tuples of arrays, numbers and texts. An archive of
@@ -64,7 +54,7 @@ def read_table_file(source: Source) -> Any:
         UnsafeFileError: if the file is empty, damaged, too large or of another kind, or holds
             anything that is no data.
     """
-    content = content_of(source, MAX_ARCHIVE_BYTES)
+    content = files.content_of(source, files.MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
     suffix = Path(source).suffix.lower() if isinstance(source, str | Path) else ""
     if not content.strip():
@@ -74,8 +64,6 @@ def read_table_file(source: Source) -> Any:
             return _array_file(content, budget)
         if content.startswith(b"PK\3\4"):
             return _archive(content, budget)
-        if content.startswith(b"\x1f\x8b"):
-            raise UnsafeFileError("is compressed: unpack it first")
         if suffix == ".json":
             budget.charge_json(content)
             return json.loads(content.decode("utf-8-sig"))
@@ -92,16 +80,10 @@ def read_table_file(source: Source) -> Any:
 
 
 class TableReader(Reader):
-    """Records pickles of all protocols, also those of Python 2."""
+    """Records pickles of all protocols."""
 
-    instructions: ClassVar[frozenset[str]] = INSTRUCTIONS | frozenset(
-        ["INT", "LONG", "FLOAT", "UNICODE", "STRING", "BINSTRING", "SHORT_BINSTRING", "LIST", "DICT", "PUT", "GET"]
-    )
+    instructions: ClassVar[frozenset[str]] = INSTRUCTIONS | _OLD
     dispatch: ClassVar[dict[int, Any]] = dict(Reader.dispatch)
-
-    def __init__(self, file: io.BytesIO, budget: Budget) -> None:
-        super().__init__(file, budget)
-        self.encoding = "latin1"  # of Python 2's texts, which hold the bytes of arrays as well
 
     def load_filled_dictionary(self) -> None:
         items = self.pop_mark()  # type: ignore[attr-defined]
@@ -132,7 +114,8 @@ class TableBuild(Build):
         if not (state is None or (isinstance(state, Made) and state.name == DICTIONARY)):
             raise wrong(made)
         found, depth = self.dictionary(made.items), self.depth
-        for key, value in () if state is None else zip(state.items[::2], state.items[1::2]):
+        items = [] if state is None else state.items
+        for key, value in zip(items[::2], items[1::2], strict=True):
             try:
                 found[_checked_key(self(key))] = self(value)
             except UnsafeFileError:
@@ -147,10 +130,9 @@ def _checked_key(key: Any) -> Any:
     if isinstance(key, tuple):
         return tuple(map(_checked_key, key))
     plain = key.item() if isinstance(key, np.generic) else key
-    if not (plain is None or isinstance(plain, str | int | float)):
-        raise UnsafeFileError(f"uses a {type(plain).__name__} as a key")
-    if isinstance(plain, int) and abs(plain) >= _END_OF_KEYS:
-        raise UnsafeFileError("uses a large number as a key")
+    is_large = isinstance(plain, int) and abs(plain) >= _END_OF_KEYS
+    if is_large or not (plain is None or isinstance(plain, str | int | float)):
+        raise UnsafeFileError(f"uses a {'large' if is_large else ''} {type(plain).__name__} as key")
     return plain
 
 
@@ -158,47 +140,24 @@ def _as_dictionary(made: Made, build: Build) -> Any:
     """A defaultdict, whose maker of missing values is not built, an OrderedDict or a Counter."""
     assert isinstance(build, TableBuild)
     given = made.args[0] if made.args else None
-    found: dict[Any, Any] = {}
-    if isinstance(given, Made) and given.name == DICTIONARY:
-        found = build.dictionary(given.items)
-    elif isinstance(given, list):  # of pairs, as of an OrderedDict in Python 2
-        found = build.dictionary([part for pair in given for part in pair])
-    return {**found, **build.dictionary(made.items)}
-
-
-def _encoded(made: Made, build: Build) -> bytes:
-    text, encoding = build(made.args)
-    if encoding != "latin1":
-        raise wrong(made)
-    return bytes(text, encoding)
-
-
-def _of_latin(made: Made, build: Build) -> Any:
-    """As in `ARRAYS`, of which Python 2 holds the bytes as a text."""
-    parts = made.state if made.name.endswith("_reconstruct") else made.args
-    if isinstance(parts, tuple) and parts and isinstance(parts[-1], str):
-        parts = (*parts[:-1], parts[-1].encode("latin1"))
-        made = Made(made.name, parts, parts)
-    return ARRAYS[made.name](made, build)
+    is_given = isinstance(given, Made) and given.name == DICTIONARY
+    return {**(build(given) if is_given else {}), **build.dictionary(made.items)}
 
 
 _MAKERS: Mapping[str, Maker] = {
     **ARRAYS,
-    **{f"numpy._core.multiarray.{name}": _of_latin for name in ("_reconstruct", "scalar")},
     **{f"collections.{name}": _as_dictionary for name in ("defaultdict", "OrderedDict", "Counter")},
-    "_codecs.encode": _encoded,
+    # How protocols 0 to 2 hold bytes.
+    "_codecs.encode": lambda made, build: build(made.args)[0].encode("latin1"),
     **dict.fromkeys(("builtins.bytes", "__builtin__.bytes"), lambda made, build: b""),
 }
 
 
-def read_pickled_table(
-    content: bytes, budget: Budget | None = None, makers: Mapping[str, Maker] | None = None
-) -> Any:
-    """Build the value of a pickle as data; ``makers`` allow further objects."""
-    budget = budget or Budget(len(content))
+def read_pickled_table(content: bytes, budget: Budget) -> Any:
+    """Build the value of a pickle as data."""
     budget.left += min(_TIMES_DENSE * len(content), _MOST_DENSE)
     tree = TableReader(io.BytesIO(content), budget).load()
-    return TableBuild({**_MAKERS, **(makers or {})}, {}, budget)(tree)
+    return TableBuild(_MAKERS, {}, budget)(tree)
 
 
 # --- NumPy's files, and tensors -------------------------------------------------------------------
@@ -213,56 +172,24 @@ def _array_file(content: bytes, budget: Budget) -> Any:
     rest = content[file.tell() :]
     if dtype == np.dtype(object):
         return read_pickled_table(rest, budget)
-    if dtype.kind not in "biuf":
-        raise UnsafeFileError("holds an array of a type other than numbers")
-    count = math.prod(shape)
-    if count * dtype.itemsize > len(rest):
-        raise UnsafeFileError(f"is cut off: an array of shape {shape} is larger than the file")
-    flat: NDArray[Any] = np.frombuffer(rest, dtype, count)
+    if dtype.kind not in "biuf" or math.prod(shape) * dtype.itemsize > len(rest):
+        raise UnsafeFileError(f"is cut off, or holds no numbers: an array {shape} of {dtype}")
+    flat: NDArray[Any] = np.frombuffer(rest, dtype, math.prod(shape))
     return flat.reshape(shape, order="F" if is_fortran else "C")
 
 
 def _archive(content: bytes, budget: Budget) -> Any:
     """The arrays of an .npz file by name, or the value of a .pt or .pth file."""
-    members = read_members(content, budget)
-    pickled = [name for name in members if name.rpartition("/")[2] == "data.pkl"]
-    if pickled:
-        folder = pickled[0].removesuffix("data.pkl")
-        tensors: Any = {PERSISTENT_ID: partial(_storage, members, folder)}
-        tensors |= {f"torch._utils.{name}": maker for name, maker in _OF_TENSORS.items()}
-        return read_pickled_table(members[pickled[0]], budget, tensors)
+    members = files.read_members(content, budget)
+    if any(name.endswith("data.pkl") for name in members):
+        from rl_yardstick.safe_files.known_objects import load_tensors, tensors_in
+
+        found = tensors_in(load_tensors(content, budget))
+        return {name: tensor.detach().numpy() for name, tensor in found}
     if not all(name.endswith(".npy") for name in members):
         raise UnsafeFileError("is a zip that holds no arrays")
     arrays = {name.removesuffix(".npy"): held for name, held in members.items()}
     return {name: _array_file(held, budget) for name, held in arrays.items()}
-
-
-_STORAGES = {"Bool": "?", "Byte": "u1", "Char": "i1", "Short": "i2", "Int": "i4", "Long": "i8"}
-_STORAGES |= {"Half": "f2", "Float": "f4", "Double": "f8"}
-
-
-def _storage(members: Mapping[str, bytes], folder: str, made: Made, _: Build) -> NDArray[Any]:
-    """The numbers of a tensor's storage."""
-    _, kind, key, *_ = made.args[0]
-    name = kind.name.removeprefix("torch.").removesuffix("Storage")
-    return np.frombuffer(members[f"{folder}data/{key}"], np.dtype(_STORAGES[name]))
-
-
-def _tensor(made: Made, build: Build) -> NDArray[Any]:
-    """The array of a tensor; no element lies outside of its storage."""
-    storage, first, shape, strides = build(made.args[:4])
-    last = first + sum(step * (n - 1) for n, step in zip(shape, strides, strict=True))
-    if min(first, *shape, *strides) < 0 or (math.prod(shape) and last >= len(storage)):
-        raise UnsafeFileError("a tensor that is larger than its storage")
-    build.budget.charge(math.prod(shape) * storage.itemsize)
-    steps = [step * storage.itemsize for step in strides]
-    return np.lib.stride_tricks.as_strided(storage[first:], shape, steps).copy()
-
-
-_OF_TENSORS: Mapping[str, Maker] = {
-    "_rebuild_tensor_v2": _tensor,
-    "_rebuild_parameter": lambda made, build: build(made.args[0]),
-}
 
 
 # --- CSV ------------------------------------------------------------------------------------------
@@ -281,26 +208,12 @@ def _rows(text: str, budget: Budget) -> Any:
     begins = [name.lower().removeprefix("unnamed: 0") for name in heading[:2]]
     if len(heading) == 3 and begins[0] in _STATES and begins[1] in _ACTIONS:
         return {(state, action): float(value) for state, action, value in rows}
-    if begins and begins[0] in _STATES:
-        return {row[0]: _by_heading(heading[1:], row[1:]) for row in rows}
     if heading:
-        return [_by_heading(heading, row) for row in rows]
+        named = [dict(zip(heading, row, strict=True)) for row in rows]
+        if begins[0] not in _STATES:
+            return named
+        return {row.pop(heading[0]): row for row in named}
     try:
-        return np.array([[float(cell) for cell in row] for row in rows])
+        return np.array(rows, dtype=np.float64)
     except ValueError:
-        if all(map(_is_number, (cell for row in rows for cell in row[1:]))):
-            return {row[0]: np.array([float(cell) for cell in row[1:]]) for row in rows}
-        found = next(cell for row in rows for cell in row if not _is_number(cell))
-        raise UnsafeFileError(f"holds {shown(found)}, which is no number") from None
-
-
-def _by_heading(heading: list[str], row: list[str]) -> dict[str, float]:
-    return {name: float(cell) for name, cell in zip(heading, row, strict=True)}
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+        return {row[0]: np.array(row[1:], dtype=np.float64) for row in rows}

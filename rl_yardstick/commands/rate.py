@@ -1,0 +1,203 @@
+"""``rate``: how good Q-tables, models and own policies are, against the exact optimum."""
+
+from __future__ import annotations
+
+import csv
+import io
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rl_yardstick.commands import cli
+from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
+from rl_yardstick.pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from rl_yardstick.rating.ratings import Rating
+
+# Suffixes of the files below a folder that are rated.
+SUFFIXES = (".npy", ".npz", ".pkl", ".pickle", ".json", ".csv", ".pt", ".pth", ".zip")
+
+EPILOG = """\
+examples:
+  python -m rl_yardstick rate q_table.npy --env FrozenLake-v1
+  python -m rl_yardstick rate q.pkl --env FrozenLake-v1 --env-kwargs map_name:8x8
+  python -m rl_yardstick rate homework/ --env Taxi-v4 --table marks.csv
+  python -m rl_yardstick rate script.py:policy --env Blackjack-v1   # its code runs
+
+Files are read as data; a script runs, because you typed its name. Exit code: 0, also if some of
+several files cannot be rated; 2 if the only one cannot.
+"""
+
+
+def build_parser() -> OneLineParser:
+    """The flags."""
+    words = "Rate Q-tables, models and policies against the exact optimum."
+    told = "table, model zip or run folder; a folder of those; or script.py:policy"
+    bins = "of observations, as in bins:10 low:[-2,-3] high:[2,3]"
+    flags = (
+        flag("files", told, nargs="+", metavar="FILE"),
+        flag("--env", "environment id (default: as in the file or run folder)"),
+        *shared("--env-kwargs", "--gym-packages"),
+        several("--bins", bins),
+        flag("--table --csv", "also write the table to this file", Path, metavar="FILE"),
+        *shared("--json"),
+    )
+    return OneLineParser(words, EPILOG, {"": flags})
+
+
+def main() -> int:
+    """Rate files."""
+    args = build_parser().parse_args()
+    cli.import_typed(args)
+    from rl_yardstick.commands.terminal import say, table_console
+    from rl_yardstick.pipeline.files import write_json, write_text
+
+    console = table_console()
+    with console.status("rating"):
+        rated = _ratings(args)
+    _print_table(console, rated)
+    if len(rated) == 1:
+        say(console, "\n".join(_details(*rated.values())))
+    if args.table is not None:
+        write_text(args.table, _as_csv(rated))
+    if args.json is not None:
+        found = {
+            name: one if isinstance(one, str) else one.as_data() for name, one in rated.items()
+        }
+        write_json(args.json, found)
+    return 0
+
+
+def _ratings(args: Any) -> dict[str, Rating | str]:
+    """The ratings by name, or why something could not be rated."""
+    from rl_yardstick.pipeline.settings import parse_assignments
+    from rl_yardstick.rating.ratings import is_model, rated_file, rated_model
+    from rl_yardstick.rating.worlds import World, world_of
+
+    kwargs = parse_assignments(args.env_kwargs, "--env-kwargs")
+    bins = parse_assignments(args.bins, "--bins")
+
+    @cache
+    def world(named: str | None) -> World:
+        if not (args.env or named):
+            raise UserError("names no environment: add --env ID")
+        return world_of(args.env or named or "", kwargs, bins)
+
+    if args.env:
+        world(None)
+    found: dict[str, Rating | str] = {}
+    paths = [path for typed in args.files for path in _below(Path(typed))]
+    for path in paths:
+        try:
+            if _is_script(path):
+                found[str(path)] = _rated_script(str(path), world(None))
+            elif is_model(path):
+                wanted = {"env_id": args.env or None, "env_kwargs": kwargs}
+                wanted |= {"typed": args.gym_packages}
+                found[str(path)] = rated_model(path, wanted, len(paths) == 1)
+            else:
+                found |= rated_file(path, world, len(paths) == 1)
+        except UserError as error:
+            if len(paths) == 1:
+                raise UserError(f"{path} {str(error).removeprefix(f'{path} ')}") from error
+            found[str(path)] = str(error).removeprefix(f"{path} ").removeprefix(f"{path}: ")
+    return found
+
+
+def _below(path: Path) -> Iterator[Path]:
+    """A path, or the files and run folders below a folder that is no run."""
+    from rl_yardstick.rating.ratings import is_model
+
+    if not path.is_dir() or is_model(path):
+        yield path
+        return
+    is_empty = True
+    for member in sorted(path.iterdir()):
+        if member.name.startswith((".", "__")) or (member.is_dir() and member.is_symlink()):
+            continue
+        if member.is_dir() or member.suffix.lower() in SUFFIXES:
+            is_empty = False
+            yield from _below(member)
+    if is_empty:
+        raise UserError(f"{path} holds no file to rate: none ends in {', '.join(SUFFIXES)}")
+
+
+def _is_script(path: Path) -> bool:
+    module, colon, name = str(path).rpartition(":")
+    return bool(colon and module and name.isidentifier() and not path.exists())
+
+
+def _rated_script(typed: str, world: Any) -> Rating:
+    """The rating of something in a module of the user, which is imported."""
+    from rl_yardstick.pipeline.components import import_modules, module_name
+    from rl_yardstick.rating.ratings import acting, rated_function
+
+    module, _, name = typed.rpartition(":")
+    import_modules([module])
+    found = getattr(sys.modules[module_name(module)], name, None)
+    act = acting(found() if isinstance(found, type) else found)
+    if act is None:
+        raise UserError(f"{typed} is no function, and has no act, predict or get_action")
+    return rated_function(act, world, typed)
+
+
+# --- what is shown --------------------------------------------------------------------------------
+
+
+def _cells(name: str, rated: Rating | str) -> list[str]:
+    """Name, return, optimum, score and note."""
+    from rl_yardstick.commands.terminal import figures
+    from rl_yardstick.rating.ratings import floored
+
+    if isinstance(rated, str):
+        return [name, "", "", "", rated]
+    if rated.optimum is None:
+        return [name, *figures(rated.mean_return), "", "", "; ".join(rated.notes[:2])]
+    numbers = figures(rated.mean_return, rated.optimum)
+    return [name, *numbers, floored(rated.score), "; ".join(rated.notes[:2])]
+
+
+def _print_table(console: Any, rated: dict[str, Rating | str]) -> None:
+    from rich.table import Table
+
+    environments = {one.environment for one in rated.values() if not isinstance(one, str)}
+    table = Table(title=", ".join(sorted(environments)), title_justify="left")
+    table.add_column("file", overflow="fold", max_width=26)
+    for name in ("return", "optimum", "score"):
+        table.add_column(name, justify="right", no_wrap=True)
+    if len(rated) > 1:
+        table.add_column("note", overflow="fold")
+    for name, one in rated.items():
+        table.add_row(*_cells(name, one)[: len(table.columns)])
+    n_failed = sum(isinstance(one, str) for one in rated.values())
+    console.print(table)
+    if n_failed:
+        console.print(f"{n_failed} of {len(rated)} could not be rated")
+
+
+def _details(rating: Rating) -> Iterator[str]:
+    """The scale, the notes, the map, and where it loses."""
+    from rl_yardstick.commands.terminal import result_lines
+    from rl_yardstick.report.words import why_lines
+
+    yield from result_lines(rating.evaluation)
+    yield from rating.notes
+    yield from filter(None, [rating.map])
+    if rating.explanation is not None:
+        yield from why_lines(rating.explanation)
+
+
+def _as_csv(rated: dict[str, Rating | str]) -> str:
+    columns = ("file", "return", "optimum", "score", "success", "environment", "note")
+    writer = csv.writer(text := io.StringIO(), lineterminator="\n")
+    writer.writerow(columns)
+    for name, one in rated.items():
+        if isinstance(one, str):
+            writer.writerow([name, "", "", "", "", "", one])
+            continue
+        numbers = one.mean_return, one.optimum, one.score, one.success_rate
+        writer.writerow([name, *numbers, one.environment, "; ".join(one.notes)])
+    return text.getvalue()
