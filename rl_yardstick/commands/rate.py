@@ -59,8 +59,9 @@ def main() -> int:
     with console.status("rating"):
         rated = _ratings(args)
     _print_table(console, rated)
-    if len(rated) == 1:
-        say(console, "\n".join(_details(*rated.values())))
+    for one in rated.values():
+        if len(rated) == 1 and not isinstance(one, str):
+            say(console, "\n".join(_details(one)))
     if args.table is not None:
         write_text(args.table, _as_csv(rated))
     if args.json is not None:

@@ -25,7 +25,7 @@ from rl_yardstick.pipeline.errors import UserError, shown
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 from rl_yardstick.pipeline.run import RECORD
-from rl_yardstick.rating.tables import Table, as_table, tables_in
+from rl_yardstick.rating.tables import Table, as_table, flat, tables_in
 from rl_yardstick.rating.worlds import N_EPISODES, SEED, Env, World, world_of
 from rl_yardstick.safe_files.files import UnsafeFileError
 from rl_yardstick.safe_files.tables import read_table_file
@@ -101,9 +101,11 @@ def rated_table(table: Table, world: World, name: str, with_details: bool = Fals
         notes.insert(0, f"never trained: every value is {table.values.flat[0]:g}")
     if exact is None:
         chances = table.values if table.is_policy else _greedy(table.values)
-        evaluation = world.played(_drawing(world, lambda obs: chances[world.row_of(obs)]))
+        evaluation = world.played(
+            _drawing(world, lambda obs: chances[world.rows_at(np.array([flat(obs)]))[0]])
+        )
         return Rating(name, world.name, evaluation, tuple(notes))
-    rows, model = world.row_of_state(), exact.model
+    rows, model = world.rows_of_states(), exact.model
     values = table.values[rows]
     policy: NDArray[Any] = values if table.is_policy else values.argmax(axis=1)
     evaluation = exact.worth(policy)
@@ -170,7 +172,8 @@ def _on_values(facts: Mapping[str, Any]) -> Iterator[str]:
     least, most = facts.get("ties_least", -np.inf), facts.get("ties_most", np.inf)
     if facts["ties"] and most - least > 1e-9 * max(1.0, abs(most)):
         told = f"; others return {least:.4g} to {most:.4g}" if most < np.inf else ""
-        yield f"ties in {facts['ties']} states, {facts['ties_met']} on its way: takes the first{told}"
+        met = f"{facts['ties']} states, {facts['ties_met']} on its way"
+        yield f"ties in {met}: takes the first{told}"
     if facts["equal_met"] + facts["equal_elsewhere"]:
         told = f"{facts['equal_met']} states on its way, {facts['equal_elsewhere']} elsewhere"
         yield f"never updated (all values equal): {told}"
@@ -215,7 +218,10 @@ def floored(score: float) -> str:
 
 def rated_function(act: Callable[[Any], Any], world: World, name: str) -> Rating:
     """The rating of a function from an observation to an action or to probabilities of actions."""
-    start, n = int(getattr(world.env.action_space, "start", 0)), world.rows.n_actions
+    actions: Any = world.env.action_space
+    if not isinstance(actions, gym.spaces.Discrete):
+        return Rating(name, world.name, world.played(act))
+    start, n = int(actions.start), int(actions.n)
 
     def chances(observation: Any) -> Floats:
         answer = act(observation)

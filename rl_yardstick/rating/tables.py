@@ -132,7 +132,8 @@ def tables_in(content: Any) -> dict[str, Any]:
     """
     if isinstance(content, np.ndarray) and content.dtype == object:
         content = content.item() if content.ndim == 0 else content.tolist()
-    if isinstance(content, Mapping) and any(_key(key) is None for key in content):
+    is_mapping = isinstance(content, Mapping)
+    if is_mapping and any(isinstance(key, str) and _key(key) is None for key in content):
         named = {str(key).lower(): value for key, value in content.items()}
         usual = [name for name in USUAL_NAMES if name in named][:1]
         found = {name: named[name] for name in usual or named if _may_be_table(named[name])}
