@@ -13,7 +13,6 @@ from stable_baselines3 import PPO
 
 from rl_yardstick import mdp
 from rl_yardstick.envs import known_models
-from rl_yardstick.mdp.transition_model import TransitionModel
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.rating import rate
 from tests.pipeline.short_runs import trained
@@ -37,32 +36,7 @@ def dry():
     return planned(LAKE, **DRY)
 
 
-class Corridor(gym.Env):
-    """Three cells in a row, whose middle is the start: right earns 1 and ends, left 0.5."""
-
-    observation_space, action_space = gym.spaces.Discrete(3), gym.spaces.Discrete(2)
-
-    def __init__(self):
-        self.P = {
-            0: {0: [(1.0, 0, 0.5, True)], 1: [(1.0, 1, 0.0, False)]},
-            1: {0: [(1.0, 0, 0.0, False)], 1: [(0.5, 2, 0.0, False), (0.5, 0, 0.0, False)]},
-            2: {0: [(1.0, 1, 0.0, False)], 1: [(1.0, 2, 1.0, True)]},
-        }
-        self.initial_state_distrib = np.array([0.0, 1.0, 0.0])
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.s = 1
-        return self.s, {}
-
-    def step(self, action):
-        row = self.P[self.s][int(action)]
-        pick = int(self.np_random.random() >= row[0][0]) if len(row) > 1 else 0
-        _, self.s, reward, terminated = row[pick]
-        return self.s, reward, terminated, False, {}
-
-
-def test_the_optimum_zeros_and_one_policy_by_hand():
+def test_the_optimum_zeros_and_policies_by_hand():
     best = rate(planned("Warehouse-v0", 1.0), "Warehouse-v0")
     assert (best.score, best.success_rate) == (pytest.approx(1), 1)
     zeros = rate(np.zeros((16, 4)), LAKE, **DRY)
@@ -70,39 +44,36 @@ def test_the_optimum_zeros_and_one_policy_by_hand():
     assert zeros.map.splitlines() == ["????", "?X?X", "???X", "X??G"]
     # Down, down, right, right, down, right: the shortest way without ice.
     table = np.zeros((16, 4))
-    for state, action in {0: 1, 4: 1, 8: 2, 9: 2, 10: 1, 14: 2}.items():
+    for state, action in {0: 1, 4: 1, 8: 2, 9: 2, 13: 2, 10: 1, 14: 2}.items():
         table[state, action] = 1
     found = rate(table, LAKE, **DRY)
     assert (found.mean_return, found.optimum, found.score, found.mean_length) == (1, 1, 1, 6)
-    assert found.map.splitlines() == ["v???", "vX?X", ">>vX", "X?>G"]
-    assert found.facts["equal_met"] == 0
-    assert found.facts["equal_elsewhere"] == 5
-    assert "1" in repr(found) and "<table>" in found._repr_html_()
+    assert found.map.splitlines() == ["v???", "vX?X", ">>vX", "X>>G"]
+    assert (found.equal_met, found.equal_elsewhere) == (0, 4)
+    assert "score 1" in repr(found)
+    assert "<th>score</th><td>1</td>" in found._repr_html_()
+    chances = np.where(table.any(axis=1, keepdims=True), table, 0.25)
+    chances[4] = 0, 0.6, 0.4, 0  # to the right is a hole
+    for policy in (chances, lambda state: chances[state]):
+        assert rate(policy, LAKE, **DRY).mean_return == pytest.approx(0.6)
 
 
 def test_the_range_of_ties_is_that_of_all_policies():
-    table = np.array([[1.0, 1.0], [2.0, 2.0], [0.0, 3.0]])
-    found = rate(table, Corridor())
-    model = TransitionModel.from_gymnasium(Corridor().P, Corridor().initial_state_distrib)
+    env = gym.make("DeepSea-v0", size=3)
+    model = known_models.transition_model(env)
+    table = np.random.default_rng(1).integers(0, 2, model.prob.shape[:2])
+    tops = [np.flatnonzero(row == row.max()) for row in table]
+    choices = [top if here else [0] for top, here in zip(tops, model.reachable, strict=True)]
     returns = [
-        mdp.policy_return(model, np.array(policy), 1000).expected_return
-        for policy in itertools.product((0, 1), repeat=3)
-        if policy[2] == 1
+        mdp.policy_return(model, np.array(policy), 100).expected_return
+        for policy in itertools.product(*choices)
     ]
-    assert found.facts["ties_least"] == pytest.approx(min(returns))
-    assert found.facts["ties_most"] == pytest.approx(max(returns))
-    assert (found.facts["ties"], found.facts["ties_met"]) == (2, 2)
-    assert found.mean_return == pytest.approx(returns[0]) == 0.5
-    assert found.notes[0].startswith("ties in 2 states, 2 on its way: takes the first")
-
-
-def test_a_stochastic_policy_is_rated_as_such():
-    chances = np.array([[1, 0], [0.25, 0.75], [0, 1]])
-    # From the middle: 0.25 left, 0.375 to each end.
-    found = rate(chances, Corridor())
-    assert found.mean_return == pytest.approx(0.625 * 0.5 + 0.375)
-    same = rate(lambda state: chances[state], Corridor())
-    assert same.mean_return == pytest.approx(found.mean_return)
+    found = rate(table, env)
+    assert found.ties == sum(len(choice) > 1 for choice in choices) > 2
+    assert found.ties_least == pytest.approx(min(returns))
+    assert found.ties_most == pytest.approx(max(returns)) != found.ties_least
+    assert found.mean_return == pytest.approx(returns[0])
+    assert f"ties in {found.ties} states, {found.ties_met} on its way" in found.notes[0]
 
 
 def test_another_order_of_actions_and_another_lake_are_found(lake, dry):
@@ -170,8 +141,8 @@ def test_hands_of_blackjack_in_five_forms():
 
 
 REFUSED = {
-    "another map": (np.zeros((64, 4)), "needs 16 x 4 (states x actions); 64 x 4 is the shape of "
-                    "FrozenLake-v1 with --env-kwargs map_name:8x8"),
+    "another map": (np.zeros((64, 4)), "needs 16 x 4 (states x actions); 64 x 4 is the shape of"),
+    "a larger map": (np.ones((64, 4)), "FrozenLake-v1 with --env-kwargs map_name:8x8"),
     "another game": (np.zeros((500, 6)), "500 x 6 is the shape of Taxi-v4"),
     "values of states": (np.linspace(0, 1, 16), "one value of each state"),
     "nan": (np.where(np.eye(16, 4) > 0, np.nan, 1.0), "nan in 4 states"),
@@ -239,9 +210,8 @@ def test_tables_need_no_pytorch_and_files_run_nothing(tmp_path, typed, monkeypat
     assert (code, err) == (0, "")
     assert "1 of 3 could not be rated" in out
     rows = (tmp_path / "marks.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in rows] == [
-        "file", *(f"class/{name}" for name in ("deeper/zeros.npy", "evil.pkl", "hf.pkl"))
-    ]  # fmt: skip
+    names = "deeper/zeros.npy", "evil.pkl", "hf.pkl"
+    assert [row.split(",")[0] for row in rows[1:]] == [f"class/{name}" for name in names]
     assert "its file names Taxi-v3" in rows[3]
     assert json.loads((tmp_path / "marks.json").read_text())["class/hf.pkl"]["score"] > 0.9
     assert not (tmp_path / "mark").exists()
