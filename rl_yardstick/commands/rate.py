@@ -137,7 +137,10 @@ def _rated_script(typed: str, world: Any) -> Rating:
     from rl_yardstick.rating.ratings import acting, rated_function
 
     module, _, name = typed.rpartition(":")
-    import_modules([module])
+    try:
+        import_modules([module])
+    except UserError as error:
+        raise UserError(str(error).replace(f"--gym-packages {module}", typed)) from error
     found = getattr(sys.modules[module_name(module)], name, None)
     act = acting(found() if isinstance(found, type) else found)
     if act is None:
