@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -40,6 +38,7 @@ def build_parser() -> OneLineParser:
     flags = (
         flag("files", told, nargs="+", metavar="FILE"),
         flag("--env", "environment id (default: as in the file or run folder)"),
+        flag("--algo", "agent in a zip that lies in no run folder"),
         *shared("--env-kwargs", "--gym-packages"),
         several("--bins", bins),
         flag("--table --csv", "also write the table to this file", Path, metavar="FILE"),
@@ -63,7 +62,10 @@ def main() -> int:
         if len(rated) == 1 and not isinstance(one, str):
             say(console, "\n".join(_details(one)))
     if args.table is not None:
-        write_text(args.table, _as_csv(rated))
+        import pandas as pd
+
+        rows = pd.DataFrame([_row(name, one) for name, one in rated.items()])
+        write_text(args.table, rows.to_csv(index=False, lineterminator="\n"))
     if args.json is not None:
         found = {
             name: one if isinstance(one, str) else one.as_data() for name, one in rated.items()
@@ -96,15 +98,16 @@ def _ratings(args: Any) -> dict[str, Rating | str]:
             if _is_script(path):
                 found[str(path)] = _rated_script(str(path), world(None))
             elif is_model(path):
-                wanted = {"env_id": args.env or None, "env_kwargs": kwargs}
+                wanted = {"env_id": args.env or None, "env_kwargs": kwargs, "algo": args.algo}
                 wanted |= {"typed": args.gym_packages}
                 found[str(path)] = rated_model(path, wanted, len(paths) == 1)
             else:
                 found |= rated_file(path, world, len(paths) == 1)
         except UserError as error:
+            fault = str(error).removeprefix(f"{path} ").removeprefix(f"{path}: ")
             if len(paths) == 1:
-                raise UserError(f"{path} {str(error).removeprefix(f'{path} ')}") from error
-            found[str(path)] = str(error).removeprefix(f"{path} ").removeprefix(f"{path}: ")
+                raise UserError(f"{path}: {fault}") from error
+            found[str(path)] = fault
     return found
 
 
@@ -151,34 +154,39 @@ def _rated_script(typed: str, world: Any) -> Rating:
 # --- what is shown --------------------------------------------------------------------------------
 
 
-def _cells(name: str, rated: Rating | str) -> list[str]:
-    """Name, return, optimum, score and note."""
-    from rl_yardstick.commands.terminal import figures
-    from rl_yardstick.rating.ratings import floored
-
+def _row(name: str, rated: Rating | str) -> dict[str, Any]:
+    """The row of the tables."""
+    row: dict[str, Any] = {"file": name}
+    row |= dict.fromkeys(("return", "optimum", "score", "success", "environment", "note"), "")
     if isinstance(rated, str):
-        return [name, "", "", "", rated]
-    if rated.optimum is None:
-        return [name, *figures(rated.mean_return), "", "", "; ".join(rated.notes[:2])]
-    numbers = figures(rated.mean_return, rated.optimum)
-    return [name, *numbers, floored(rated.score), "; ".join(rated.notes[:2])]
+        return {**row, "note": rated}
+    row |= {"environment": rated.environment, "note": "; ".join(rated.notes[:2])}
+    numbers = {"return": rated.mean_return, "optimum": rated.optimum, "score": rated.score}
+    numbers["success"] = rated.success_rate
+    return row | {key: number for key, number in numbers.items() if number is not None}
 
 
 def _print_table(console: Any, rated: dict[str, Rating | str]) -> None:
     from rich.table import Table
 
-    environments = {one.environment for one in rated.values() if not isinstance(one, str)}
-    table = Table(title=", ".join(sorted(environments)), title_justify="left")
+    from rl_yardstick.commands.terminal import figures
+    from rl_yardstick.rating.ratings import floored
+
+    rows = [_row(name, one) for name, one in rated.items()]
+    environments = sorted({row["environment"] for row in rows} - {""})
+    table = Table(title=", ".join(environments), title_justify="left")
     table.add_column("file", overflow="fold", max_width=26)
     for name in ("return", "optimum", "score"):
         table.add_column(name, justify="right", no_wrap=True)
-    if len(rated) > 1:
+    if len(rows) > 1:
         table.add_column("note", overflow="fold")
-    for name, one in rated.items():
-        table.add_row(*_cells(name, one)[: len(table.columns)])
-    n_failed = sum(isinstance(one, str) for one in rated.values())
+    for row in rows:
+        known = [row[key] for key in ("return", "optimum") if row[key] != ""]
+        numbers = [*figures(*known), "", ""][:2]
+        score = "" if row["score"] == "" else floored(row["score"])
+        table.add_row(*[row["file"], *numbers, score, row["note"]][: len(table.columns)])
     console.print(table)
-    if n_failed:
+    if n_failed := sum(isinstance(one, str) for one in rated.values()):
         console.print(f"{n_failed} of {len(rated)} could not be rated")
 
 
@@ -192,16 +200,3 @@ def _details(rating: Rating) -> Iterator[str]:
     yield from filter(None, [rating.map])
     if rating.explanation is not None:
         yield from why_lines(rating.explanation)
-
-
-def _as_csv(rated: dict[str, Rating | str]) -> str:
-    columns = ("file", "return", "optimum", "score", "success", "environment", "note")
-    writer = csv.writer(text := io.StringIO(), lineterminator="\n")
-    writer.writerow(columns)
-    for name, one in rated.items():
-        if isinstance(one, str):
-            writer.writerow([name, "", "", "", "", "", one])
-            continue
-        numbers = one.mean_return, one.optimum, one.score, one.success_rate
-        writer.writerow([name, *numbers, one.environment, "; ".join(one.notes)])
-    return text.getvalue()

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -25,7 +25,7 @@ from rl_yardstick.pipeline.errors import UserError, shown
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 from rl_yardstick.pipeline.run import RECORD
-from rl_yardstick.rating.tables import Table, as_table, flat, tables_in
+from rl_yardstick.rating.tables import Table, as_table, tables_in
 from rl_yardstick.rating.worlds import N_EPISODES, SEED, Env, World, world_of
 from rl_yardstick.safe_files.files import UnsafeFileError
 from rl_yardstick.safe_files.tables import read_table_file
@@ -52,11 +52,6 @@ class Rating:
     facts: Mapping[str, Any] = field(default_factory=dict)
     explanation: Explanation | None = None  #: where it loses
     map: str = ""  #: a grid world with the actions that it takes
-
-    def __post_init__(self) -> None:
-        if not self.evaluation.is_exact:
-            told = f"sampled, {N_EPISODES} episodes: the model of the environment is not known"
-            object.__setattr__(self, "notes", (*self.notes, told))
 
     @property
     def figures(self) -> dict[str, Any]:
@@ -100,11 +95,9 @@ def rated_table(table: Table, world: World, name: str, with_details: bool = Fals
     if is_blank:
         notes.insert(0, f"never trained: every value is {table.values.flat[0]:g}")
     if exact is None:
-        chances = table.values if table.is_policy else _greedy(table.values)
-        evaluation = world.played(
-            _drawing(world, lambda obs: chances[world.rows_at(np.array([flat(obs)]))[0]])
-        )
-        return Rating(name, world.name, evaluation, tuple(notes))
+        n, best = world.rows.n_actions, table.values.argmax(axis=1)
+        chances = table.values if table.is_policy else np.eye(n)[best]
+        return _sampled(world, lambda obs: chances[world.row_of(obs)], name, notes)
     rows, model = world.rows_of_states(), exact.model
     values = table.values[rows]
     policy: NDArray[Any] = values if table.is_policy else values.argmax(axis=1)
@@ -113,12 +106,10 @@ def rated_table(table: Table, world: World, name: str, with_details: bool = Fals
     if not table.is_policy:
         met = mdp.state_visitation(model, policy, exact.horizon) > 0
         equal = _are_equal(values) & model.reachable
+        lacking = ~table.filled[rows] & model.reachable
+        counted = {"equal_met": equal & met, "equal_elsewhere": equal & ~met, "missing": lacking}
         facts = _ties(values, met, exact)
-        facts |= {
-            "equal_met": int((equal & met).sum()),
-            "equal_elsewhere": int((equal & ~met).sum()),
-        }
-        facts["missing"] = int((~table.filled[rows] & model.reachable).sum())
+        facts |= {fact: int(states.sum()) for fact, states in counted.items()}
         if not is_blank:
             better = _better_ways(world, policy, exact.yardstick.score(evaluation.mean_return))
             notes = [*better, *_on_values(facts), *notes]
@@ -135,15 +126,13 @@ def _with_details(rating: Rating, world: World, policy: NDArray[Any], equal: Boo
     return replace(rating, explanation=explained, map=drawn)
 
 
-def _greedy(values: Floats) -> Floats:
-    best: Floats = np.eye(values.shape[1])[values.argmax(axis=1)]
-    return best
-
-
-def _drawing(world: World, chances: Callable[[Any], Floats]) -> Callable[[Any], int]:
-    """Actions by their probabilities at an observation, from a generator of their own."""
+def _sampled(
+    world: World, chances: Callable[[Any], Floats], name: str, notes: Sequence[str] = ()
+) -> Rating:
+    """A rating by episodes, from the probabilities of actions at an observation."""
     start, rng = int(getattr(world.env.action_space, "start", 0)), np.random.default_rng(SEED)
-    return lambda obs: start + int(rng.choice(len(p := chances(obs)), p=p))
+    found = world.played(lambda obs: start + int(rng.choice(len(p := chances(obs)), p=p)))
+    return Rating(name, world.name, found, (*notes, f"sampled, {N_EPISODES} episodes"))
 
 
 def _are_equal(values: Floats) -> Bools:
@@ -220,7 +209,8 @@ def rated_function(act: Callable[[Any], Any], world: World, name: str) -> Rating
     """The rating of a function from an observation to an action or to probabilities of actions."""
     actions: Any = world.env.action_space
     if not isinstance(actions, gym.spaces.Discrete):
-        return Rating(name, world.name, world.played(act))
+        told = (f"sampled, {N_EPISODES} episodes",)
+        return Rating(name, world.name, world.played(act), told)
     start, n = int(actions.start), int(actions.n)
 
     def chances(observation: Any) -> Floats:
@@ -234,12 +224,11 @@ def rated_function(act: Callable[[Any], Any], world: World, name: str) -> Rating
         raise UserError(f"{name} returns {shown(answer)} at {shown(observation)}: {told}")
 
     if world.exact is None:
-        return Rating(name, world.name, world.played(_drawing(world, chances)))
+        return _sampled(world, chances, name)
     observed = world.observed()
     first, second = ([chances(obs) for obs in observed.values()] for _ in range(2))
     if not np.array_equal(first, second):
-        told = ("it draws its actions, or remembers",)
-        return Rating(name, world.name, world.played(_drawing(world, chances)), told)
+        return _sampled(world, chances, name, ["it draws its actions, or remembers"])
     policy = np.full((world.exact.model.n_states, n), 1 / n)
     policy[list(observed)] = first
     rating = Rating(name, world.name, world.exact.worth(policy))
@@ -283,7 +272,8 @@ def rated_model(path: Path, wanted: Mapping[str, Any], with_details: bool = Fals
         evaluation = judge.evaluator.at_the_end(agent)
     if with_details and judge.exact is not None:
         explained = explanation(found.spec, agent, judge.exact)
-    notes = (found.spec.algo,)
+    told = () if evaluation.is_exact else (f"sampled, {len(evaluation.returns)} episodes",)
+    notes = (found.spec.algo, *told)
     return Rating(str(path), found.spec.env_id, evaluation, notes, explanation=explained)
 
 

@@ -111,16 +111,6 @@ def parts_of(space: spaces.Space[Any]) -> list[tuple[int, int]] | None:
     return None if None in found else [part for parts in found for part in parts or ()]
 
 
-def flat(observation: Any) -> list[int]:
-    """The whole numbers of one observation."""
-    if isinstance(observation, Mapping):
-        observation = tuple(observation.values())
-    if isinstance(observation, tuple | list):
-        return [number for part in observation for number in flat(part)]
-    numbers: list[int] = np.asarray(observation).ravel().astype(np.int64).tolist()
-    return numbers
-
-
 # --- the tables in a file -------------------------------------------------------------------------
 
 
@@ -133,7 +123,7 @@ def tables_in(content: Any) -> dict[str, Any]:
     if isinstance(content, np.ndarray) and content.dtype == object:
         content = content.item() if content.ndim == 0 else content.tolist()
     is_mapping = isinstance(content, Mapping)
-    if is_mapping and any(isinstance(key, str) and _key(key) is None for key in content):
+    if is_mapping and any(isinstance(key, str) and key_of(key) is None for key in content):
         named = {str(key).lower(): value for key, value in content.items()}
         usual = [name for name in USUAL_NAMES if name in named][:1]
         found = {name: named[name] for name in usual or named if _may_be_table(named[name])}
@@ -225,13 +215,15 @@ def _as_values(
 # --- dictionaries ---------------------------------------------------------------------------------
 
 
-def _key(key: Any) -> tuple[int, ...] | None:
+def key_of(key: Any) -> tuple[int, ...] | None:
     """The numbers that a state, or a state and an action, consists of; None if it has others."""
     if isinstance(key, str):
         found = _NUMBERS.findall(key.replace("True", "1").replace("False", "0"))
         return tuple(int(float(number)) for number in found) or None
+    if isinstance(key, np.ndarray | Mapping):  # an observation
+        key = key.ravel().tolist() if isinstance(key, np.ndarray) else list(key.values())
     if isinstance(key, tuple | list):
-        parts = [_key(part) for part in key]
+        parts = [key_of(part) for part in key]
         return None if None in parts else tuple(one for part in parts for one in part or ())
     number = key.item() if isinstance(key, np.generic) else key
     is_whole = isinstance(number, int) or (isinstance(number, float) and number.is_integer())
@@ -247,7 +239,7 @@ def _of_mapping(content: Mapping[Any, Any], rows: Rows) -> Table:
             return (*key[:-1], names.get(key[-1].lower(), key[-1]))
         return names.get(key.lower(), key) if isinstance(key, str) else key
 
-    keys = {key: _key(named(key)) for key in content}
+    keys = {key: key_of(named(key)) for key in content}
     if len({len(numbers or ()) for numbers in keys.values()}) != 1 or None in keys.values():
         wrong = next((key for key, numbers in keys.items() if numbers is None), next(iter(keys)))
         raise UserError(f"has the key {shown(wrong)}, which is no state of {rows.name}")
@@ -269,7 +261,7 @@ def _of_mapping(content: Mapping[Any, Any], rows: Rows) -> Table:
     for state, value in zip(states, values, strict=True):
         if isinstance(value, Mapping):
             table[state] = -np.inf  # an action that is left out cannot be chosen
-            taken = np.array([_key(named(action)) or (-1,) for action in value])[:, 0]
+            taken = np.array([key_of(named(action)) or (-1,) for action in value])[:, 0]
             table[state, _checked(taken, rows)] = list(value.values())
         elif np.shape(value) == (rows.n_actions,):
             table[state] = value

@@ -20,7 +20,7 @@ from rl_yardstick.pipeline.environments import EVALUATION_TIME_LIMIT, MISTAKES, 
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator, evaluator_in
 from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, bracket_of
-from rl_yardstick.rating.tables import Rows, parts_of
+from rl_yardstick.rating.tables import Rows, key_of, parts_of
 
 N_EPISODES, SEED = 100, 0  # of a sampled rating
 MOST_ROWS = 50_000_000
@@ -62,19 +62,19 @@ class World:
         grid = (layout.n_rows, layout.n_columns) if layout is not None and is_flat else None
         return Rows(self.name, sizes, first, int(actions.n), action_names(env), grid, seen)
 
-    def rows_at(self, parts: Ints) -> Ints:
-        """The rows of observations, given by their parts, shape (n, parts)."""
-        found = self.rows.numbers(parts)
-        assert found is not None
-        return found
-
     def rows_of_states(self) -> Ints:
         """The row of the observation of each state of the model, shape (S,); 0 for unreachable."""
         assert self.exact is not None
         assert self.rows.seen is not None
-        numbers = np.zeros(self.exact.model.n_states, np.int64)
-        numbers[self.exact.model.reachable] = self.rows_at(self.rows.seen)
+        numbers, found = np.zeros(self.exact.model.n_states, np.int64), self.rows.seen
+        numbers[self.exact.model.reachable] = self.rows.numbers(found)  # type: ignore[assignment]
         return numbers
+
+    def row_of(self, observation: Any) -> int:
+        """The row of one observation."""
+        found = self.rows.numbers(np.array([key_of(observation)]))
+        assert found is not None
+        return int(found[0])
 
     @cached_property
     def other(self) -> World | None:
