@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -148,7 +149,8 @@ def _rated_script(typed: str, world: Any) -> Rating:
     act = acting(found() if isinstance(found, type) else found)
     if act is None:
         raise UserError(f"{typed} is no function, and has no act, predict or get_action")
-    return rated_function(act, world, typed)
+    rated = rated_function(act, world, typed)
+    return replace(rated, notes=(*rated.notes, "its own code ran"))
 
 
 # --- what is shown --------------------------------------------------------------------------------

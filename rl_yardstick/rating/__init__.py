@@ -11,8 +11,8 @@ __all__ = ["Rating", "rate"]
 
 
 def __getattr__(name: str) -> object:
-    if name in __all__:
-        from rl_yardstick.rating import ratings
+    if name not in __all__:
+        raise AttributeError(f"module 'rl_yardstick.rating' has no attribute {name!r}")
+    from rl_yardstick.rating import ratings
 
-        return getattr(ratings, name)
-    raise AttributeError(f"module 'rl_yardstick.rating' has no attribute {name!r}")
+    return getattr(ratings, name)

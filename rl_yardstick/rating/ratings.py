@@ -169,7 +169,7 @@ def _on_values(facts: Mapping[str, Any]) -> Iterator[str]:
     if facts["missing"]:
         yield f"lacks {facts['missing']} of the states that can be reached"
     if facts["ties"] and most - least <= 1e-9 * max(1.0, abs(most)):
-        yield f"ties, in {facts['ties']} states, do not change the return"
+        yield "its ties do not change the return"
 
 
 def _better_ways(world: World, policy: Ints, score: float) -> Iterator[str]:
@@ -215,13 +215,16 @@ def rated_function(act: Callable[[Any], Any], world: World, name: str) -> Rating
 
     def chances(observation: Any) -> Floats:
         answer = act(observation)
-        found = np.asarray(answer[0] if isinstance(answer, tuple) else answer, np.float64).ravel()
+        found = np.zeros(0)
+        with suppress(ValueError, TypeError):  # no numbers
+            told = answer[0] if isinstance(answer, tuple) else answer
+            found = np.asarray(told, np.float64).ravel()
         if found.size == 1 and found[0] - start in range(n):
             return np.asarray(np.eye(n)[int(found[0]) - start])
         if found.size == n and (found >= 0).all() and abs(found.sum() - 1) <= 1e-5:
             return np.asarray(found / found.sum())
-        told = f"it must return an action or {n} probabilities"
-        raise UserError(f"{name} returns {shown(answer)} at {shown(observation)}: {told}")
+        needed = f"it must return an action or {n} probabilities"
+        raise UserError(f"{name} returns {shown(answer)} at {shown(observation)}: {needed}")
 
     if world.exact is None:
         return _sampled(world, chances, name)

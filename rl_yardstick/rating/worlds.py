@@ -17,13 +17,14 @@ from rl_yardstick.envs.layout import FREE, START, action_names, grid_layout
 from rl_yardstick.envs.wrappers import DiscretizeObservation
 from rl_yardstick.mdp.transition_model import Bools, Ints
 from rl_yardstick.pipeline.environments import EVALUATION_TIME_LIMIT, MISTAKES, make_env
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import UserError, one_line, unknown
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator, evaluator_in
 from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, bracket_of
 from rl_yardstick.rating.tables import Rows, key_of, parts_of
 
 N_EPISODES, SEED = 100, 0  # of a sampled rating
 MOST_ROWS = 50_000_000
+BINS = ("bins", "low", "high", "dims")
 _ARROWS = {(-1, 0): "^", (1, 0): "v", (0, -1): "<", (0, 1): ">"}
 
 Env = gym.Env[Any, Any]
@@ -46,13 +47,13 @@ class World:
         parts = parts_of(env.observation_space)
         if isinstance(env, DiscretizeObservation):
             parts = [(int(n), 0) for n in env.bins]
-        if parts is None:
-            space, given = env.observation_space, "--bins bins:10 low:[-2,-3] high:[2,3]"
-            raise UserError(f"{self.name} has observations {space}: give the table's, as {given}")
-        sizes = tuple(size for size, _ in parts)
+        sizes = tuple(size for size, _ in parts or ())
         if not isinstance(actions, spaces.Discrete) or np.prod(sizes, dtype=float) > MOST_ROWS:
-            spoken = f"observations {env.observation_space} and actions {actions}"
-            raise UserError(f"{self.name} has {spoken}, which fit no table")
+            raise UserError(f"{self.name} has too many observations or actions for a table")
+        if parts is None:
+            fault = f"has observations of shape {env.observation_space.shape}, which are no states"
+            given = "--bins bins:10 low:[-2,-3] high:[2,3]"
+            raise UserError(f"{self.name} {fault}: give the bins of the table, as in {given}")
         seen = None
         if exact is not None:
             states = np.asarray(exact.observations[exact.model.reachable], np.int64)
@@ -149,6 +150,9 @@ def world_of(
     env_id = env if isinstance(env, str) else ""
     if time_limit(made) is None:
         made = gym.wrappers.TimeLimit(made, EVALUATION_TIME_LIMIT)
+    for key in bins or ():
+        if key not in BINS:
+            raise unknown("--bins: unknown argument", key, BINS)
     try:
         made = DiscretizeObservation(made, **bins) if bins else made
     except MISTAKES as error:
