@@ -84,16 +84,21 @@ def _ratings(args: Any) -> dict[str, Rating | str]:
     kwargs = parse_assignments(args.env_kwargs, "--env-kwargs")
     bins = parse_assignments(args.bins, "--bins")
 
-    @cache
+    made = cache(lambda env_id: world_of(env_id, kwargs, bins))
+
     def world(named: str | None) -> World:
         if not (args.env or named):
             raise UserError("names no environment: add --env ID")
-        return world_of(args.env or named or "", kwargs, bins)
+        found: World = made(args.env or named)
+        return found
 
     if args.env:
-        world(None)
+        made(args.env)
     found: dict[str, Rating | str] = {}
     paths = [path for typed in args.files for path in _below(Path(typed))]
+    if not paths:
+        suffixes = ", ".join(SUFFIXES)
+        raise UserError(f"{args.files[0]} holds no file to rate: none ends in {suffixes}")
     for path in paths:
         try:
             if _is_script(path):
@@ -119,15 +124,11 @@ def _below(path: Path) -> Iterator[Path]:
     if not path.is_dir() or is_model(path):
         yield path
         return
-    is_empty = True
     for member in sorted(path.iterdir()):
         if member.name.startswith((".", "__")) or (member.is_dir() and member.is_symlink()):
             continue
         if member.is_dir() or member.suffix.lower() in SUFFIXES:
-            is_empty = False
             yield from _below(member)
-    if is_empty:
-        raise UserError(f"{path} holds no file to rate: none ends in {', '.join(SUFFIXES)}")
 
 
 def _is_script(path: Path) -> bool:

@@ -3,6 +3,7 @@
 import itertools
 import json
 import pickle
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -193,7 +194,9 @@ def test_a_model_and_its_run_have_the_rating_of_its_training(tmp_path):
 
 def test_tables_need_no_pytorch_and_files_run_nothing(tmp_path, typed, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "class" / "deeper").mkdir(parents=True)
+    for folder in ("deeper", "images", ".git"):
+        (tmp_path / "class" / folder).mkdir(parents=True)
+    (tmp_path / "class" / ".git" / "a.npy").write_bytes(b"")
     np.save("class/deeper/zeros.npy", np.zeros((16, 4)))
     (tmp_path / "class" / "evil.pkl").write_bytes(b"cos\nmkdir\n(Vmark\ntR.")
     (tmp_path / "class" / "notes.md").write_text("not a table")
@@ -214,4 +217,10 @@ def test_tables_need_no_pytorch_and_files_run_nothing(tmp_path, typed, monkeypat
     (tmp_path / "own.py").write_text("policy = lambda state: 2\n")
     code, out, _ = typed("yardstick", "rate", "own.py:policy", "--env", LAKE)
     assert (code, "score 0 " in out) == (0, True)
+    assert "its own code ran" in out
     sys.modules.pop("own", None)
+    light = (
+        f"import numpy, sys\nfrom rl_yardstick.rating import rate\nrate(numpy.eye(16, 4), '{LAKE}')"
+    )
+    code = f"{light}\nsys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -123,7 +123,7 @@ def test_attacks_are_refused_in_one_line(attack, tmp_path, monkeypatch):
     try:
         with pytest.raises(UnsafeFileError) as refusal:
             read_table_file(io.BytesIO(ATTACKS[attack]))
-        assert tracemalloc.get_traced_memory()[1] < 400e6
+        assert tracemalloc.get_traced_memory()[1] < 100e6
     finally:
         tracemalloc.stop()
     assert str(refusal.value).isprintable()
