@@ -18,6 +18,7 @@ COMMANDS = {
     "compare": "compare agents over seeds, and write a page",
     "tune": "search for an agent's settings, and test them on other seeds",
     "explain": "show where an agent loses return against the optimum",
+    "rate": "rate Q-tables, models and policies against the exact optimum",
     "shaping": "show whether other rewards in training change the optimum, and their cost",
     "audit": "test an implementation for known bugs",
     "inspect": "list the content of a model file without running any of it",

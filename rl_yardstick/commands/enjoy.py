@@ -186,7 +186,8 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
     import numpy as np
 
     from rl_yardstick.commands.terminal import figures, result_lines
-    from rl_yardstick.pipeline.evaluation.sampled import Evaluation, bracketed_yardstick
+    from rl_yardstick.pipeline.evaluation.sampled import bracketed_yardstick
+    from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 
     returns, lengths = np.array(show.played, dtype=np.float64).T
     yardstick = None if is_normalised else bracketed_yardstick(spec)

@@ -17,8 +17,7 @@ from rl_yardstick.pipeline.errors import visible
 from rl_yardstick.pipeline.evaluation.yardstick import ROUNDING, rounding
 
 if TYPE_CHECKING:
-    from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
-    from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+    from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, OtherReturns, Yardstick
 
 APART = "   "  # between the figures of a result
 LINE = 100  # columns of text in a file or a pipe

@@ -23,16 +23,12 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.base_class import BaseAlgorithm
 
-from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
-from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
-from rl_yardstick.agents.policies import own_values
-from rl_yardstick.diagnosis.proposals import proposals
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.envs.layout import action_names, state_name
 from rl_yardstick.mdp import (
@@ -48,9 +44,11 @@ from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.evaluation.critics import learns_exploring_values
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.spec import TrainSpec
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
 MOST_OUTCOMES = 500_000  # of a model to plan in for an agent's objective: about a second
 TIE = 1e-9  # action values within this of the best, relative to it, count as ties
@@ -167,10 +165,25 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
     if reason := evaluator.obstacle(agent):
         raise UserError(f"{spec.algo} cannot be explained: {reason}")
     policy = evaluator.policy(agent, deterministic=True)
+    with closing(make_single_env(spec)) as env:
+        return explanation_of_policy(env, evaluator, policy, (spec, agent))
+
+
+def explanation_of_policy(
+    env: gym.Env[Any, Any],
+    evaluator: ExactEvaluator,
+    policy: NDArray[Any],
+    learner: tuple[TrainSpec, BaseAlgorithm] | None = None,
+) -> Explanation:
+    """As `explanation`, of a policy in a form of `mdp.evaluation`, on the evaluator's environment.
+
+    Without a ``learner``, a spec and its agent, the explanation has no parts and no proposals.
+    """
     try:
         split = gap_by_state(evaluator.model, policy, evaluator.horizon)
     except ValueError as error:
-        raise UserError(f"{spec.algo} on {spec.env_id} cannot be explained: {error}") from error
+        what = "this" if learner is None else f"{learner[0].algo} on {learner[0].env_id}"
+        raise UserError(f"{what} cannot be explained: {error}") from error
     explained = Explanation(
         optimum=split.optimum,
         value=split.value,
@@ -181,30 +194,36 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
     )
     if explained.is_optimal:
         return explained
-    task = _task(spec, agent, evaluator)
-    found = Found(evaluator, agent, policy, split, task)
-    with closing(make_single_env(spec)) as env:
-        known = action_names(env)
-        more = (f"action {action}" for action in range(len(known), evaluator.model.n_actions))
-        names = partial(state_name, env, evaluator.layout), (*known, *more)
-        alike = None if found.groups is None else found.alike(names)
-        explained = replace(
-            explained,
-            parts=found.parts(),
-            states=found.states(names),
-            repairs=() if alike else found.repairs(names),
-            discount=None if task is None else task.discount,
-            own_gap=found.own_gap(),
-            is_caught=found.is_caught(),
-            looks_alike=alike is not None,
-        )
-        if alike is not None or not explained.is_concentrated:
-            explained = replace(explained, road=alike or found.road(names))
-    return replace(explained, proposals=proposals(spec, found, explained.parts))
+    task = None if learner is None else _task(*learner, evaluator)
+    found = Found(evaluator, None if learner is None else learner[1], policy, split, task)
+    known = action_names(env)
+    more = (f"action {action}" for action in range(len(known), evaluator.model.n_actions))
+    names = partial(state_name, env, evaluator.layout), (*known, *more)
+    alike = None if found.groups is None else found.alike(names)
+    explained = replace(
+        explained,
+        parts=found.parts(),
+        states=found.states(names),
+        repairs=() if alike else found.repairs(names),
+        discount=None if task is None else task.discount,
+        own_gap=found.own_gap(),
+        is_caught=found.is_caught(),
+        looks_alike=alike is not None,
+    )
+    if alike is not None or not explained.is_concentrated:
+        explained = replace(explained, road=alike or found.road(names))
+    if learner is None:
+        return explained
+    from rl_yardstick.diagnosis.proposals import proposals
+
+    return replace(explained, proposals=proposals(learner[0], found, explained.parts))
 
 
 def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> Task | None:
     """The agent's objective; None where it is unknown, too large, or of another shape."""
+    from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
+    from rl_yardstick.pipeline.evaluation.critics import learns_exploring_values
+
     discount, shape = getattr(agent, "gamma", None), evaluator.model.prob.shape
     if isinstance(agent, PlanningAgent | RandomAgent) or not isinstance(discount, int | float):
         return None
@@ -219,31 +238,38 @@ def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> T
     return Task(model, float(discount), epsilon, _noisy(model, epsilon) if epsilon > 0 else model)
 
 
+def _beliefs(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
+    """The values that an agent acts by, (S, A) or (S,); a softmax does not act by its values."""
+    from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
+    from rl_yardstick.agents.policies import own_values
+
+    return None if isinstance(agent, SoftmaxAlgorithm) else own_values(agent, observations)
+
+
 class Found:
     """The analysis of one agent's gap."""
 
     def __init__(
         self,
         evaluator: ExactEvaluator,
-        agent: BaseAlgorithm,
+        agent: BaseAlgorithm | None,
         policy: NDArray[Any],
         split: GapByState,
         task: Task | None,
     ) -> None:
         self.evaluator, self.split, self.task, self.policy = evaluator, split, task, policy
-        self.model, self.horizon, self.agent = evaluator.model, evaluator.horizon, agent
+        self.model, self.horizon = evaluator.model, evaluator.horizon
+        self.agent: Any = agent
         # the likeliest action at the first step, shape (S,)
         chances = policy_matrix(self.model, canonical_policy(self.model, policy))
         self.taken: Ints = chances.argmax(axis=1)
         self.groups = None
         if evaluator.scale is not None:
             self.groups = observation_groups(evaluator.observations, self.model.reachable)
-        self.beliefs: Floats | None = None  # a softmax does not act by its values
-        if not isinstance(agent, SoftmaxAlgorithm):
-            self.beliefs = own_values(agent, evaluator.observations)
+        self.beliefs = None if agent is None else _beliefs(agent, evaluator.observations)
         # how often each pair of state and action of a table was updated, shape (S, A)
         self.updates: Ints | None = None
-        counts = getattr(agent.policy, "visit_counts", None)
+        counts = getattr(getattr(agent, "policy", None), "visit_counts", None)
         if counts is not None and evaluator.observations.ndim == 1:
             summed: Ints = counts.numpy().sum(axis=0)[evaluator.observations]
             self.updates = summed if summed.any() else None

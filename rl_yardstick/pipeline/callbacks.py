@@ -25,8 +25,9 @@ from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.pipeline.errors import one_line
 from rl_yardstick.pipeline.evaluation.critics import CriticRecorder
 from rl_yardstick.pipeline.evaluation.judge import Judge
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator
+from rl_yardstick.pipeline.evaluation.sampled import SampledEvaluator
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
+from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 from rl_yardstick.pipeline.files import replacing
 from rl_yardstick.pipeline.finite_numbers import check_model
 from rl_yardstick.pipeline.run import LAST_PULLS, PULLS_FILE, Run, save_agent

@@ -29,8 +29,8 @@ from rl_yardstick.pipeline.environments import first_seed, make_training_env, tr
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line
 from rl_yardstick.pipeline.evaluation.critics import recorder_of
 from rl_yardstick.pipeline.evaluation.judge import Judge
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
+from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 from rl_yardstick.pipeline.finite_numbers import NumberWatch, check_model
 from rl_yardstick.pipeline.models import REPLAY_BUFFER, begun_with, load_to_train
 from rl_yardstick.pipeline.pictures import draw

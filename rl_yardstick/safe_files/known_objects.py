@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common import buffers, noise, torch_layers
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
@@ -27,6 +26,7 @@ from torch.distributions.transforms import AffineTransform, ComposeTransform, Ex
 from torch.nn.modules import activation
 
 from rl_yardstick.safe_files import pickles
+from rl_yardstick.safe_files.arrays import ARRAYS
 from rl_yardstick.safe_files.files import Budget, UnsafeFileError, read_members, shown
 from rl_yardstick.safe_files.pickles import Build, Made, Maker, fields, pairs, wrong
 
@@ -48,42 +48,7 @@ def filled(cls: Any, made: Made, build: Build) -> Any:
     return new
 
 
-# --- NumPy's types, arrays, numbers and generators ------------------------------------------------
-
-# Booleans, integers, floats, and objects; no texts, records or dates.
-_TYPES = frozenset(["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8", "O8"])
-
-
-def _dtype(made: Made, build: Build) -> np.dtype[Any]:
-    code, state = made.args[0], made.state
-    if code not in _TYPES:
-        raise UnsafeFileError("holds an array of a type other than numbers")
-    dtype = np.dtype(object if code == "O8" else code)
-    return dtype.newbyteorder(state[1]) if isinstance(state, tuple) else dtype
-
-
-def _array(data: Any, dtype: Any, shape: Any, order: Any = "C") -> NDArray[Any]:
-    if isinstance(data, list) is not dtype.hasobject:
-        raise TypeError("an array of objects has a list of them, others have bytes")
-    flat = np.fromiter(data, object) if dtype.hasobject else np.frombuffer(data, dtype)
-    return flat.reshape(shape, order=order).copy(order=order)  # an array on bytes is read-only
-
-
-def _from_buffer(made: Made, build: Build) -> NDArray[Any]:
-    data, dtype, shape, order, *axes = build(made.args)
-    if axes:  # since NumPy 2.3, for an array with another memory order of its axes
-        return _array(data, dtype, shape).transpose(axes[0])
-    return _array(data, dtype, shape, order)
-
-
-def _reconstructed(made: Made, build: Build) -> NDArray[Any]:
-    _, shape, dtype, is_fortran, data = build(made.state)
-    return _array(data, dtype, shape, "F" if is_fortran else "C")
-
-
-def _scalar(made: Made, build: Build) -> Any:
-    dtype, data = build(made.args)
-    return _array(data, dtype, ())[()]
+# --- NumPy's generators and classes ------------------------------------------------------------
 
 
 def _generator(made: Made, build: Build) -> np.random.Generator:
@@ -97,10 +62,7 @@ def _generator(made: Made, build: Build) -> np.random.Generator:
 
 
 _OF_NUMPY: Mapping[str, Maker] = {
-    "numpy.dtype": _dtype,
-    "numpy._core.numeric._frombuffer": _from_buffer,
-    "numpy._core.multiarray._reconstruct": _reconstructed,
-    "numpy._core.multiarray.scalar": _scalar,
+    **ARRAYS,
     "numpy.random._pickle.__generator_ctor": _generator,
     # The legacy generator of Gym's spaces: Gymnasium's make a new one.
     "numpy.random._pickle.__randomstate_ctor": lambda made, build: None,

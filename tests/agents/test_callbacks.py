@@ -12,7 +12,7 @@ from stable_baselines3.common.logger import configure
 
 from rl_yardstick.agents.common.callbacks import BlockCallback, members
 from rl_yardstick.pipeline.callbacks import Checkpoint, EvaluationCallback
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation
+from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 from rl_yardstick.pipeline.run import Run
 from rl_yardstick.pipeline.spec import TrainSpec
 from tests.agents.trainings import LAKE, Every, environment, make, state_of

@@ -16,8 +16,7 @@ import yaml
 from rl_yardstick.commands.terminal import result_lines
 from rl_yardstick.commands.train import build_parser, describe_pulls, next_commands
 from rl_yardstick.pipeline.callbacks import PullSummary
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation
-from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
+from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, HiddenState, Yardstick
 from rl_yardstick.pipeline.run import Run
 
 LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]

@@ -15,25 +15,30 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rl_yardstick import mdp
-from rl_yardstick.agents import policies
-from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.envs import known_models
 from rl_yardstick.envs.layout import GridLayout, grid_layout
 from rl_yardstick.mdp.beliefs import Bracket, memory_optimum
 from rl_yardstick.mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats
 from rl_yardstick.pipeline.environments import evaluation_kwargs, make_single_env
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
-from rl_yardstick.pipeline.evaluation.yardstick import FAILED, HiddenState, Yardstick
+from rl_yardstick.pipeline.evaluation.yardstick import (
+    FAILED,
+    Evaluation,
+    HiddenState,
+    OtherReturns,
+    Yardstick,
+)
 from rl_yardstick.pipeline.spec import TrainSpec
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
 # Limit for the array with the observations of all states.
 MOST_BYTES_OBSERVED = 1 << 30
@@ -145,7 +150,7 @@ class ExactEvaluator:
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """Evaluate the agent's current policy exactly."""
-        return self._worth(self.policy(agent, deterministic))
+        return self.worth(self.policy(agent, deterministic))
 
     def at_the_end(self, agent: BaseAlgorithm) -> Evaluation:
         """Evaluate the final policy, and compute its `other_returns`."""
@@ -156,6 +161,8 @@ class ExactEvaluator:
 
         Empty if the model is large.
         """
+        from rl_yardstick.agents import policies
+
         found, discount = OtherReturns(), getattr(agent, "gamma", None)
         if self.model.prob.size * self.horizon > MOST_OUTCOMES_OF_OTHERS:
             return found
@@ -179,7 +186,9 @@ class ExactEvaluator:
         return cache(lambda d: mdp.finite_horizon_optimum(self.model, self.horizon, d).start_value)
 
     @cached_property
-    def _worth(self) -> OfLastPolicy[Evaluation]:
+    def worth(self) -> OfLastPolicy[Evaluation]:
+        """The function from a policy to its evaluation."""
+
         def worth(policy: NDArray[Any]) -> Evaluation:
             found = mdp.policy_return(self.model, policy, self.horizon, success=self.success)
             rate, std = found.success_rate, float(np.sqrt(found.return_variance))
@@ -201,6 +210,9 @@ class ExactEvaluator:
 
     def policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
         """The policy: probabilities (S, A), or actions (S,), or actions by step (horizon, S)."""
+        from rl_yardstick.agents import policies
+        from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
+
         if isinstance(agent, PlanningAgent):
             n_steps = 1 if agent.policy.is_stationary else self.horizon
             return agent.policy.actions_after(self.observations[None], np.arange(n_steps)[:, None])
@@ -210,6 +222,8 @@ class ExactEvaluator:
 
     def instead(self, agent: BaseAlgorithm, found: Evaluation) -> str | None:
         """What a failed agent's greedy policy does; None if it has not failed, or is random."""
+        from rl_yardstick.agents.planning import RandomAgent
+
         if isinstance(agent, RandomAgent):
             return None
         policy, yardstick = self.policy(agent, deterministic=True), self.yardstick
@@ -251,6 +265,8 @@ class ExactEvaluator:
 
     def obstacle(self, agent: BaseAlgorithm, deterministic: bool = True) -> str:
         """Why the policy cannot be computed, or only too slowly; empty if it can."""
+        from rl_yardstick.agents import policies
+
         return policies.obstacle(agent, self.observations, self.masks, self.horizon, deterministic)
 
 
@@ -285,16 +301,21 @@ def evaluator_of_single(spec: TrainSpec) -> ExactEvaluator | None:
 
 def _evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     with closing(make_single_env(spec)) as env:
-        model, horizon = known_models.transition_model(env), known_models.time_limit(env)
-        space = env.observation_space
-        n_bytes = math.prod(space.shape or ()) * np.dtype(space.dtype).itemsize
-        if model is None or horizon is None or model.n_states * n_bytes > MOST_BYTES_OBSERVED:
-            return None
-        observations = known_models.observations_of_states(env)
-        if observations is None or (optimum := _optimum(model, horizon)) is None:
-            return None
-        masks = known_models.action_masks_of_states(env)
-        success, layout = known_models.success_outcomes(env), grid_layout(env)
+        return evaluator_in(env)
+
+
+def evaluator_in(env: gym.Env[Any, Any]) -> ExactEvaluator | None:
+    """The exact evaluator of an environment, or None if episodes have to be sampled."""
+    model, horizon = known_models.transition_model(env), known_models.time_limit(env)
+    space = env.observation_space
+    n_bytes = math.prod(space.shape or ()) * np.dtype(space.dtype).itemsize
+    if model is None or horizon is None or model.n_states * n_bytes > MOST_BYTES_OBSERVED:
+        return None
+    observations = known_models.observations_of_states(env)
+    if observations is None or (optimum := _optimum(model, horizon)) is None:
+        return None
+    masks = known_models.action_masks_of_states(env)
+    success, layout = known_models.success_outcomes(env), grid_layout(env)
     if layout is not None and layout.n_states != model.n_states:
         layout = None  # the states of a user's grid world are not cells
     baseline = float(mdp.baseline_return(model, horizon))

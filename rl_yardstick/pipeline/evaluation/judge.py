@@ -31,8 +31,8 @@ from rl_yardstick.pipeline.evaluation.exact import (
     exact_evaluator,
     model_refusal,
 )
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator, n_environments
-from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+from rl_yardstick.pipeline.evaluation.sampled import SampledEvaluator, n_environments
+from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, Yardstick
 from rl_yardstick.pipeline.spec import TrainSpec
 
 

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import math
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3 import A2C
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -22,90 +20,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from rl_yardstick.agents.common.masks import check_masks_exist, present_masks
 from rl_yardstick.agents.policies import is_network, takes_masks
-from rl_yardstick.envs.brackets import may_have_bracket, optimum_bracket
-from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.envs.brackets import may_have_bracket
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, Yardstick, bracket_of
 from rl_yardstick.pipeline.finite_numbers import check_numbers
 from rl_yardstick.pipeline.spec import TrainSpec
-
-
-@dataclass(frozen=True)
-class OtherReturns:
-    """Further exact returns of the final agent; None where unknown."""
-
-    acts_by: str | None = None  # its policy in training, in words: "epsilon 0.01"
-    stochastic_return: float | None = None  # of its policy in training
-    discount: float | None = None  # the agent's discount
-    discounted_return: float | None = None  # of the greedy policy, under that discount
-    discounted_optimum: float | None = None  # under that discount; None if the state is hidden
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The result of an evaluation: sampled episodes, or their exact expectation."""
-
-    # undiscounted return of each episode, shape (n_episodes,);
-    # if exact, the expected return, of shape (1,)
-    returns: Floats
-    lengths: NDArray[np.floating[Any] | np.integer[Any]]  # number of steps, likewise
-    # whether each episode succeeded, or the probability of success, likewise; None if the
-    # environment does not report it
-    successes: NDArray[np.bool_ | np.floating[Any]] | None
-    # exact standard deviation of an episode's return; None for sampled episodes
-    exact_std: float | None = None
-    yardstick: Yardstick | None = None  # the scale for the return, if known
-    others: OtherReturns | None = None  # further returns; None for sampled episodes
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether the figures are exact expectations."""
-        return self.exact_std is not None
-
-    @cached_property
-    def mean_return(self) -> float:
-        """Mean return of an episode."""
-        return float(self.returns.mean())
-
-    @cached_property
-    def mean_length(self) -> float:
-        """Mean number of steps of an episode."""
-        return float(self.lengths.mean())
-
-    @cached_property
-    def std_return(self) -> float:
-        """Standard deviation of an episode's return."""
-        return float(self.returns.std()) if self.exact_std is None else self.exact_std
-
-    @cached_property
-    def success_rate(self) -> float | None:
-        """Share of successful episodes, if the environment reports success."""
-        return None if self.successes is None else float(self.successes.mean())
-
-    def joined(self, more: Evaluation) -> Evaluation:
-        """These sampled episodes together with further ones of the same agent."""
-        both = None
-        if self.successes is not None and more.successes is not None:
-            both = np.concatenate([self.successes, more.successes])
-        returns = np.concatenate([self.returns, more.returns])
-        return Evaluation(returns, np.concatenate([self.lengths, more.lengths]), both)
-
-    def summary(self) -> dict[str, Any]:
-        """The figures as JSON."""
-        figures: dict[str, Any] = {
-            "mean_return": self.mean_return,
-            "std_return": self.std_return,
-            "mean_length": self.mean_length,
-            "success_rate": self.success_rate,
-            "exact": self.is_exact,
-            "n_episodes": None if self.is_exact else len(self.returns),
-        }
-        if self.yardstick is not None:
-            figures |= self.yardstick.figures(self.mean_return)
-        if self.others is not None:
-            figures |= asdict(self.others)
-        return figures
 
 
 class Player:
@@ -174,10 +94,7 @@ def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
     if spec.vec_env_wrapper or not may_have_bracket(spec.env_id):
         return None
     with closing(make_single_env(spec)) as env:
-        found = optimum_bracket(env)
-    if found is None:
-        return None
-    return Yardstick(found.upper, found.baseline, found.lower, found.upper_is_proven)
+        return bracket_of(env)
 
 
 # Evaluation steps per training step: for every training, and for short ones, up to

@@ -1,9 +1,18 @@
-"""The scale of returns (baseline and optimum), and the limits below which a run has failed."""
+"""The scale of returns (baseline and optimum), evaluations, and when a run has failed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from rl_yardstick.mdp.transition_model import Floats
 
 FAILED = 0.05  # a run with a lower score has failed
 ROUNDING = 1e-12  # returns closer than this differ only by rounding
@@ -98,3 +107,93 @@ def with_memory(figures: dict[str, Any]) -> dict[str, Any]:
     kept = {name: figures[name] for name in figures if not name.endswith("at_least")}
     kept.pop("score_at_most", None)
     return kept | yardstick.figures(figures["mean_return"])
+
+
+def bracket_of(env: gym.Env[Any, Any]) -> Yardstick | None:
+    """The known bracket of an environment's optimum, or None."""
+    from rl_yardstick.envs.brackets import optimum_bracket
+
+    found = optimum_bracket(env)
+    if found is None:
+        return None
+    return Yardstick(found.upper, found.baseline, found.lower, found.upper_is_proven)
+
+
+# --- evaluations ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class OtherReturns:
+    """Further exact returns of the final agent; None where unknown."""
+
+    acts_by: str | None = None  # its policy in training, in words: "epsilon 0.01"
+    stochastic_return: float | None = None  # of its policy in training
+    discount: float | None = None  # the agent's discount
+    discounted_return: float | None = None  # of the greedy policy, under that discount
+    discounted_optimum: float | None = None  # under that discount; None if the state is hidden
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The result of an evaluation: sampled episodes, or their exact expectation."""
+
+    # undiscounted return of each episode, shape (n_episodes,);
+    # if exact, the expected return, of shape (1,)
+    returns: Floats
+    lengths: NDArray[np.floating[Any] | np.integer[Any]]  # number of steps, likewise
+    # whether each episode succeeded, or the probability of success, likewise; None if the
+    # environment does not report it
+    successes: NDArray[np.bool_ | np.floating[Any]] | None
+    # exact standard deviation of an episode's return; None for sampled episodes
+    exact_std: float | None = None
+    yardstick: Yardstick | None = None  # the scale for the return, if known
+    others: OtherReturns | None = None  # further returns; None for sampled episodes
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the figures are exact expectations."""
+        return self.exact_std is not None
+
+    @cached_property
+    def mean_return(self) -> float:
+        """Mean return of an episode."""
+        return float(self.returns.mean())
+
+    @cached_property
+    def mean_length(self) -> float:
+        """Mean number of steps of an episode."""
+        return float(self.lengths.mean())
+
+    @cached_property
+    def std_return(self) -> float:
+        """Standard deviation of an episode's return."""
+        return float(self.returns.std()) if self.exact_std is None else self.exact_std
+
+    @cached_property
+    def success_rate(self) -> float | None:
+        """Share of successful episodes, if the environment reports success."""
+        return None if self.successes is None else float(self.successes.mean())
+
+    def joined(self, more: Evaluation) -> Evaluation:
+        """These sampled episodes together with further ones of the same agent."""
+        both = None
+        if self.successes is not None and more.successes is not None:
+            both = np.concatenate([self.successes, more.successes])
+        returns = np.concatenate([self.returns, more.returns])
+        return Evaluation(returns, np.concatenate([self.lengths, more.lengths]), both)
+
+    def summary(self) -> dict[str, Any]:
+        """The figures as JSON."""
+        figures: dict[str, Any] = {
+            "mean_return": self.mean_return,
+            "std_return": self.std_return,
+            "mean_length": self.mean_length,
+            "success_rate": self.success_rate,
+            "exact": self.is_exact,
+            "n_episodes": None if self.is_exact else len(self.returns),
+        }
+        if self.yardstick is not None:
+            figures |= self.yardstick.figures(self.mean_return)
+        if self.others is not None:
+            figures |= asdict(self.others)
+        return figures
