@@ -4,6 +4,7 @@ Importing this package loads neither torch nor Stable-Baselines3, so that names 
 spaces compared quickly.
 """
 
+from rl_yardstick.agents.own_classes import name_of
 from rl_yardstick.agents.registry import (
     ALGORITHMS,
     AlgorithmEntry,
@@ -12,4 +13,11 @@ from rl_yardstick.agents.registry import (
     register,
 )
 
-__all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm", "register"]
+__all__ = [
+    "ALGORITHMS",
+    "AlgorithmEntry",
+    "fitting_algorithms",
+    "load_algorithm",
+    "name_of",
+    "register",
+]

@@ -284,6 +284,9 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
 }
 
 
+BY_VALUE: dict[str, type] = {}  # classes that `own_classes.name_of` has registered
+
+
 def register(name: str, entry_point: str, **fields: Any) -> None:
     """Add an agent of your own to the registry, so that the commands find it.
 
@@ -292,7 +295,8 @@ def register(name: str, entry_point: str, **fields: Any) -> None:
 
     Args:
         name: the value of ``--algo``.
-        entry_point: the class, a subclass of `BaseAlgorithm`, as ``"module:Class"``.
+        entry_point: the class, a subclass of `BaseAlgorithm` or a plain one with ``act`` and
+            ``learn``, as ``"module:Class"``.
         fields: further attributes of `AlgorithmEntry`, each with its default: ``summary`` (the
             class's name), ``observations`` and ``actions`` (any space), ``observation_shape``,
             ``for_bandits``, ``needs_masks``, ``has_memory``, ``package``, ``extra`` and
@@ -332,22 +336,27 @@ def _space_names(name: str, role: str, given: Any) -> tuple[str, ...]:
 
 
 def load_algorithm(name: str) -> type[BaseAlgorithm]:
-    """Import the class of the agent ``name``.
+    """Import the class of the agent ``name``; for a plain class, the algorithm that trains it.
 
     Raises:
         KeyError: if there is no agent of that name.
         ModuleNotFoundError: if the optional package that it needs is missing.
-        ValueError: if there is no such class, or it is no subclass of `BaseAlgorithm`.
+        ValueError: if there is no such class, or it cannot be trained.
     """
-    from stable_baselines3.common.base_class import BaseAlgorithm
+    from rl_yardstick.agents.own_classes import fault_of, is_plain
 
     entry_point = ALGORITHMS[name].entry_point
     module_name, class_name = entry_point.split(":")
-    algorithm = getattr(importlib.import_module(module_name), class_name, None)
-    if not (isinstance(algorithm, type) and issubclass(algorithm, BaseAlgorithm)):
-        fault = "does not exist" if algorithm is None else "is no subclass of BaseAlgorithm"
+    found: Any = BY_VALUE.get(name) or getattr(
+        importlib.import_module(module_name), class_name, None
+    )
+    if fault := "does not exist" if found is None else fault_of(found):
         raise ValueError(f"{name} is registered as {entry_point}, which {fault}")
-    return algorithm
+    if is_plain(found):
+        from rl_yardstick.agents.plain import algorithm_of
+
+        found = algorithm_of(found)
+    return found  # type: ignore[no-any-return]
 
 
 def fitting_algorithms(

@@ -256,17 +256,25 @@ def shared(*names: str, **changes: Any) -> list[Flag]:
 
 
 def import_typed(args: argparse.Namespace) -> None:
-    """Import the modules of ``--gym-packages`` and of ``--env module:Id-v0``, and drop the latter.
+    """Import the modules of ``--gym-packages``, ``--env module:Id-v0`` and ``--algo module:Class``.
 
-    ``args.env`` is one id, a list of ids, or None.
+    ``args.env`` is one id, a list of ids, or None, and is left without modules.
     """
-    from rl_yardstick.pipeline.components import import_modules, split_id
+    from rl_yardstick.pipeline.components import import_modules, module_name, split_class, split_id
 
-    ids = args.env if isinstance(args.env, list) else [args.env or ""]
+    env = getattr(args, "env", None)
+    ids = env if isinstance(env, list) else [env or ""]
     found = [split_id(env_id) for env_id in ids]
     args.gym_packages = [*args.gym_packages, *(module for module, _ in found if module)]
     names = [name for _, name in found]
-    args.env = names if isinstance(args.env, list) else names[0]
+    args.env = names if isinstance(env, list) else names[0]
+    for key in ("algo", "algos"):
+        given = getattr(args, key, None)
+        words = given if isinstance(given, list) else [given] if given else []
+        own = [word for word in words if split_class(word)[2]]
+        args.gym_packages += [word for word in own if word not in args.gym_packages]
+        words = [f"{module_name(w)}:{split_class(w)[2]}" if w in own else w for w in words]
+        setattr(args, key, words if isinstance(given, list) else words[0] if words else given)
     import_modules(args.gym_packages)
 
 

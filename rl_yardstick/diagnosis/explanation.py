@@ -31,7 +31,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
-from rl_yardstick.agents.policies import own_values
+from rl_yardstick.agents.policies import own_values, why_not_exact
 from rl_yardstick.diagnosis.proposals import proposals
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.envs.layout import action_names, state_name
@@ -164,7 +164,7 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
         UserError: where the agent's policy cannot be evaluated in all states, or the environment is
             too large.
     """
-    if reason := evaluator.obstacle(agent):
+    if reason := evaluator.obstacle(agent) or why_not_exact(agent, evaluator.observations):
         raise UserError(f"{spec.algo} cannot be explained: {reason}")
     policy = evaluator.policy(agent, deterministic=True)
     try:

@@ -10,14 +10,10 @@ A pickle can run any code, so only states with this user's signature are read.
 
 from __future__ import annotations
 
-import hmac
 import io
-import os
 import pickle
 import random
-import secrets
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +23,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
+from rl_yardstick.agents.common.model_files import signed, verified
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import read_bytes, replacing
+from rl_yardstick.safe_files.files import UnsafeFileError
 
 MAX_STATE = 1 << 36  # bytes
 _OF_PROCESS = {"locals", "globals", "class_attributes", "results_writer", "_logger"}
@@ -71,9 +69,8 @@ def save_state(path: Path, roots: dict[str, Any], process: tuple[str, ...]) -> N
     generators = random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
     stream = io.BytesIO()
     _Pickler(stream, roots).dump((attributes, positions, generators))
-    content = stream.getvalue()
     with replacing(path) as beside:
-        beside.write_bytes(hmac.digest(_key(), content, "sha256") + content)
+        beside.write_bytes(signed(stream.getvalue()))
 
 
 def load_state(path: Path, roots: dict[str, Any]) -> None:
@@ -81,10 +78,11 @@ def load_state(path: Path, roots: dict[str, Any]) -> None:
 
     Raises UserError if the state is not signed by this user.
     """
-    content = read_bytes(path, MAX_STATE)
-    if not hmac.compare_digest(content[:32], hmac.digest(_key(), content[32:], "sha256")):
-        raise UserError(f"{path} is not signed with your key: a state of others is not loaded")
-    unpickler: Any = pickle.Unpickler(io.BytesIO(content[32:]))  # noqa: S301  # signed
+    try:
+        content = verified(read_bytes(path, MAX_STATE))
+    except UnsafeFileError as error:
+        raise UserError(f"{path} {error}") from error
+    unpickler: Any = pickle.Unpickler(io.BytesIO(content))  # noqa: S301  # signed
     unpickler.persistent_load = roots.__getitem__
     attributes, positions, (python, numpy, torch) = unpickler.load()
     for name, saved in attributes.items():
@@ -97,21 +95,6 @@ def load_state(path: Path, roots: dict[str, Any]) -> None:
     random.setstate(python)
     np.random.set_state(numpy)  # noqa: NPY002
     th.set_rng_state(torch)
-
-
-def _key() -> bytes:
-    """This user's key, made on first use."""
-    folder = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "yardstick"
-    path = folder / "state.key"
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        beside = folder / f"state.key.{os.getpid()}"
-        beside.touch(mode=0o600)
-        beside.write_bytes(secrets.token_bytes(32))
-        with suppress(FileExistsError):
-            os.link(beside, path)  # the first of several processes wins
-        beside.unlink()
-    return read_bytes(path, 1000)
 
 
 def _left_out(kind: type) -> set[str]:

@@ -1,0 +1,108 @@
+"""Classes of the user as agents: plain ones with ``act`` and ``learn``, or of Stable-Baselines3.
+
+Nothing heavy is imported, so that a class that does not fit is refused at once.
+"""
+
+from __future__ import annotations
+
+import inspect
+from functools import cache
+from types import FunctionType
+from typing import Any
+
+from rl_yardstick.agents.registry import ALGORITHMS, BY_VALUE, DISCRETE, AlgorithmEntry
+
+SMALLEST = """\
+the smallest class that works:
+class MyAgent:
+    def act(self, obs):
+        return 0
+    def learn(self, obs, action, reward, next_obs, terminated):
+        pass"""
+
+# Arguments of a plain class's constructor that are given; all others are hyperparameters.
+GIVEN = ("observation_space", "action_space", "n_states", "n_actions", "seed", "env")
+_LEARN = "obs action reward next_obs terminated"
+_METHODS = {"act": "obs", "learn": _LEARN, "reset": "", "values": "obs"}
+# Usual names of the arguments of ``learn``, in its order.
+_NAMES = ("obs observation state s", "action a", "reward r")
+_NAMES += ("next_obs next_observation next_state new_obs new_state", "terminated terminal done")
+_PLACES = {name: place for place, names in enumerate(_NAMES) for name in names.split()}
+
+
+def is_plain(cls: Any) -> bool:
+    """Whether a class is none of Stable-Baselines3's algorithms."""
+    return isinstance(cls, type) and "BaseAlgorithm" not in [base.__name__ for base in cls.__mro__]
+
+
+def fault_of(cls: Any) -> str:
+    """Why an object is no class that can be trained; empty if it is one."""
+    if not isinstance(cls, type):
+        return f"is a {type(cls).__name__}, not a class"
+    lacks = [name for name in ("act", "learn") if not callable(getattr(cls, name, None))]
+    if is_plain(cls) and lacks:
+        has = [name for name in dir(cls) if not name.startswith("_")]
+        return f"lacks {' and '.join(lacks)}; it has {', '.join(has) or 'no methods'}"
+    if inspect.isabstract(cls):
+        return f"is abstract: it lacks {', '.join(sorted(cls.__abstractmethods__))}"
+    for name in [name for name in _METHODS if is_plain(cls) and hasattr(cls, name)]:
+        known, given = parameters_of(cls, name), _METHODS[name].split()
+        signature, wanted = inspect.Signature([*known.values()]), ", ".join(given)
+        named = dict.fromkeys(known.keys() & {"explore", "truncated"}, True)
+        try:
+            signature.bind(*given, **named)
+        except TypeError:
+            return f"has {name}{signature}, which does not take ({wanted})"
+        told = [*known][: len(given)] if name == "learn" else []
+        if any(_PLACES.get(word, place) != place for place, word in enumerate(told)):
+            return f"has {name}{signature}, whose order must be ({wanted})"
+    return ""
+
+
+@cache
+def parameters_of(cls: type, method: str = "") -> dict[str, inspect.Parameter]:
+    """The parameters of a class's method without ``self``, or of its constructor."""
+    function: Any = getattr(cls, method, None) if method else cls
+    try:
+        known = dict(inspect.signature(function).parameters)
+    except (TypeError, ValueError):  # there is none, or it is a builtin
+        return {}
+    if method and isinstance(inspect.getattr_static(cls, method), FunctionType):
+        known.pop(next(iter(known), ""), None)
+    return known
+
+
+def hyperparameters_of(cls: type) -> dict[str, inspect.Parameter]:
+    """The constructor's arguments but those in `GIVEN`; a whole number may be any number."""
+    found = {}
+    for name, one in parameters_of(cls).items():
+        if name not in GIVEN and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD):
+            is_number = one.annotation is one.empty and type(one.default) is int
+            kind: Any = int | float if is_number else one.annotation
+            found[name] = one.replace(kind=one.KEYWORD_ONLY, annotation=kind)
+    return found
+
+
+def add_class(name: str, cls: Any) -> None:
+    """Put a class into the registry; ValueError if it is none that can be trained."""
+    if fault := fault_of(cls):
+        raise ValueError(f"{name} {fault}")
+    takes = parameters_of(cls) if is_plain(cls) else {}
+    known = (DISCRETE if word in takes else () for word in ("n_states", "n_actions"))
+    ALGORITHMS[name] = AlgorithmEntry(f"{cls.__module__}:{cls.__name__}", cls.__name__, *known)
+
+
+def name_of(cls: type) -> str:
+    """Register a class itself, such as one of a notebook's cell, and return the agent's name.
+
+    Processes that train in parallel get it by value. It replaces a class that was registered here
+    under the same name. Raises ValueError if it cannot be trained, or a shipped agent has its name.
+    """
+    name, module = (getattr(cls, key, str(cls)) for key in ("__name__", "__module__"))
+    if module != "__main__":
+        name = f"{module}:{name}"
+    elif name not in BY_VALUE and name.lower() in map(str.lower, ALGORITHMS):
+        raise ValueError(f"there is an agent {name.lower()} already: give the class another name")
+    add_class(name, cls)
+    BY_VALUE[name] = cls
+    return name
