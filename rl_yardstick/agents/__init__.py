@@ -13,11 +13,5 @@ from rl_yardstick.agents.registry import (
     register,
 )
 
-__all__ = [
-    "ALGORITHMS",
-    "AlgorithmEntry",
-    "fitting_algorithms",
-    "load_algorithm",
-    "name_of",
-    "register",
-]
+__all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm"]
+__all__ += ["name_of", "register"]

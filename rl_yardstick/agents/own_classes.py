@@ -19,12 +19,11 @@ class MyAgent:
         return 0
     def learn(self, obs, action, reward, next_obs, terminated):
         pass"""
-
 # Arguments of a plain class's constructor that are given; all others are hyperparameters.
 GIVEN = ("observation_space", "action_space", "n_states", "n_actions", "seed", "env")
-_LEARN = "obs action reward next_obs terminated"
-_METHODS = {"act": "obs", "learn": _LEARN, "reset": "", "values": "obs"}
-# Usual names of the arguments of ``learn``, in its order.
+# What is given to methods, and the usual names of the arguments of ``learn`` in their order.
+_METHODS = {"act": "obs", "learn": "obs action reward next_obs terminated"}
+_METHODS |= {"reset": "", "values": "obs"}
 _NAMES = ("obs observation state s", "action a", "reward r")
 _NAMES += ("next_obs next_observation next_state new_obs new_state", "terminated terminal done")
 _PLACES = {name: place for place, names in enumerate(_NAMES) for name in names.split()}
@@ -38,7 +37,7 @@ def is_plain(cls: Any) -> bool:
 def fault_of(cls: Any) -> str:
     """Why an object is no class that can be trained; empty if it is one."""
     if not isinstance(cls, type):
-        return f"is a {type(cls).__name__}, not a class"
+        return f"is no class, but of type {type(cls).__name__}"
     lacks = [name for name in ("act", "learn") if not callable(getattr(cls, name, None))]
     if is_plain(cls) and lacks:
         has = [name for name in dir(cls) if not name.startswith("_")]
@@ -48,9 +47,8 @@ def fault_of(cls: Any) -> str:
     for name in [name for name in _METHODS if is_plain(cls) and hasattr(cls, name)]:
         known, given = parameters_of(cls, name), _METHODS[name].split()
         signature, wanted = inspect.Signature([*known.values()]), ", ".join(given)
-        named = dict.fromkeys(known.keys() & {"explore", "truncated"}, True)
         try:
-            signature.bind(*given, **named)
+            signature.bind(*given, **dict.fromkeys(known.keys() & {"explore", "truncated"}, True))
         except TypeError:
             return f"has {name}{signature}, which does not take ({wanted})"
         told = [*known][: len(given)] if name == "learn" else []
@@ -62,10 +60,9 @@ def fault_of(cls: Any) -> str:
 @cache
 def parameters_of(cls: type, method: str = "") -> dict[str, inspect.Parameter]:
     """The parameters of a class's method without ``self``, or of its constructor."""
-    function: Any = getattr(cls, method, None) if method else cls
     try:
-        known = dict(inspect.signature(function).parameters)
-    except (TypeError, ValueError):  # there is none, or it is a builtin
+        known = dict(inspect.signature(getattr(cls, method) if method else cls).parameters)
+    except (AttributeError, ValueError):  # there is no such method, or it is a builtin
         return {}
     if method and isinstance(inspect.getattr_static(cls, method), FunctionType):
         known.pop(next(iter(known), ""), None)
@@ -99,9 +96,8 @@ def name_of(cls: type) -> str:
     under the same name. Raises ValueError if it cannot be trained, or a shipped agent has its name.
     """
     name, module = (getattr(cls, key, str(cls)) for key in ("__name__", "__module__"))
-    if module != "__main__":
-        name = f"{module}:{name}"
-    elif name not in BY_VALUE and name.lower() in map(str.lower, ALGORITHMS):
+    name = name if module == "__main__" else f"{module}.{name}"
+    if name not in BY_VALUE and name.lower() in map(str.lower, ALGORITHMS) and "." not in name:
         raise ValueError(f"there is an agent {name.lower()} already: give the class another name")
     add_class(name, cls)
     BY_VALUE[name] = cls

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import base64
+import hmac
 import inspect
 import pickle
 import random
-from collections import defaultdict
-from collections.abc import Iterator
+from contextlib import suppress
 from copy import deepcopy
 from functools import cache
 from typing import Any, ClassVar, Self
@@ -16,7 +16,6 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import set_random_seed
@@ -33,9 +32,10 @@ class PlainPolicy(model_files.TablePolicy):
     owner: PlainAgent
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        ask = self.owner.greedy_action if deterministic else self.owner.judged.act
-        actions = [self.owner.as_array(ask(row)) for row in self.owner.rows(observation)]
-        return th.from_numpy(np.stack(actions))
+        rows = rows_of(observation)
+        greedy = self.owner.greedy_actions(rows) if deterministic else None
+        actions = [self.owner.judged.act(row) for row in rows] if greedy is None else greedy
+        return th.from_numpy(np.stack([self.owner.as_array(action) for action in actions]))
 
 
 class PlainAgent(OnlineAlgorithm):
@@ -47,6 +47,7 @@ class PlainAgent(OnlineAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"PlainPolicy": PlainPolicy}
     hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
     excluded_from_states = ("_judged",)
+    _rebuilt = (*OnlineAlgorithm._rebuilt, "agent", "_action", "_judged")
     plain: ClassVar[type]
     policy: PlainPolicy
     agent: Any  # of the class `plain`
@@ -75,11 +76,10 @@ class PlainAgent(OnlineAlgorithm):
             set_random_seed(seed)
 
     def _made(self) -> Any:
-        seen, done = self.observation_space, self.action_space
-        given = {"observation_space": seen, "action_space": done, "seed": self.seed}
+        seen, done, outside = self.observation_space, self.action_space, gym.Env[Any, Any]()
+        outside.observation_space, outside.action_space = seen, done  # it has no steps
+        given = {"observation_space": seen, "action_space": done, "seed": self.seed, "env": outside}
         given |= {"n_states": getattr(seen, "n", None), "n_actions": getattr(done, "n", None)}
-        given["env"] = outside = gym.Env[Any, Any]()  # for its spaces; it has no steps
-        outside.observation_space, outside.action_space = seen, done
         kept = {name: given[name] for name in given if name in parameters_of(self.plain)}
         own = {n: p.default for n, p in hyperparameters_of(self.plain).items()} | self.hyperparams
         if lacking := [name for name in own if own[name] is inspect.Parameter.empty]:
@@ -95,58 +95,44 @@ class PlainAgent(OnlineAlgorithm):
             self._judged = deepcopy(self.agent)
         return self._judged
 
-    def greedy_action(self, obs: Any) -> Any:
-        """The action without exploration, where the class has one."""
+    def greedy_actions(self, rows: list[Any]) -> list[Any] | None:
+        """The actions at observations without exploration; None if the class has none."""
         if "explore" in parameters_of(self.plain, "act"):
-            return self.judged.act(obs, explore=False)
-        is_discrete = isinstance(self.action_space, spaces.Discrete)
-        if is_discrete and hasattr(self.plain, "values") and (values := self._values(obs)).ndim:
-            return int(values.argmax()) + int(self.action_space.start)  # type: ignore[attr-defined]
-        return self.judged.act(obs)
+            return [self.judged.act(row, explore=False) for row in rows]
+        values = self.values_at(rows)
+        if values is None or values.ndim == 1:
+            return None
+        return (values.argmax(axis=1) + getattr(self.action_space, "start", 0)).tolist()
 
-    def _values(self, obs: Any) -> Floats:
-        values = np.asarray(self.judged.values(obs), dtype=np.float64)
-        n_actions = getattr(self.action_space, "n", 1)
-        if values.shape not in ((), (n_actions,)) or np.isnan(values).any():
-            wanted = f"one number, or one for each of {n_actions} actions"
-            raise ValueError(f"{self.plain.__name__}.values({obs}) is {values}, not {wanted}")
-        return values
-
-    def values_at(self, observations: Any) -> Floats | None:
-        """Its ``values``, shape (n, A) or (n,); None without this method."""
+    def values_at(self, rows: list[Any]) -> Floats | None:
+        """Its values at n observations, shape (n, A) or (n,); None without ``values``."""
         if not hasattr(self.plain, "values"):
             return None
-        return np.stack([self._values(row) for row in self.rows(observations)])
+        values = np.array([self.judged.values(row) for row in rows], dtype=np.float64)
+        n = getattr(self.action_space, "n", 0)  # of actions
+        if values.shape[1:] not in ((), (n,)) or np.isnan(values).any():
+            raise ValueError(f"{self.plain.__name__}.values(obs) is not one number, or {n} of them")
+        return values
 
     def as_array(self, action: Any) -> NDArray[Any]:
         """An action as environments take it: within the bounds of a Box, as in the library."""
         space: Any = self.action_space
-        if isinstance(space, spaces.Box):
+        if isinstance(space, gym.spaces.Box):
             found = np.asarray(action, dtype=space.dtype).reshape(space.shape)
             action = np.clip(found, space.low, space.high)
         if not space.contains(action):
             raise ValueError(f"{self.plain.__name__}.act returned {action!r}, not in {space}")
         return np.asarray(action, dtype=space.dtype)
 
-    def rows(self, observations: Any) -> Iterator[Any]:
-        """Each of n observations as its space has it, without the axis of length n."""
-        if isinstance(observations, dict):
-            parts = {key: np.asarray(value) for key, value in observations.items()}
-            for i in range(len(next(iter(parts.values())))):
-                yield {key: part[i] for key, part in parts.items()}
-        else:
-            found = np.asarray(observations)
-            yield from found.tolist() if found.ndim == 1 else found
-
     def _choose_actions(self) -> NDArray[Any]:
-        self._judged = None
-        self._action = self.agent.act(next(self.rows(self._last_obs)))
+        self._judged, obs = None, rows_of(self._last_obs)[0]
+        self._action = self.agent.act(obs)
         return self.as_array(self._action)[None]
 
     def _learn_from(self, transitions: Transitions) -> None:
         self._judged, is_over = None, bool(transitions.dones[0])
         terminated, reward = bool(transitions.terminated[0]), float(transitions.rewards[0])
-        obs, next_obs = (next(self.rows(o)) for o in (transitions.obs, transitions.next_obs))
+        obs, next_obs = rows_of(transitions.obs)[0], rows_of(transitions.next_obs)[0]
         takes = parameters_of(self.plain, "learn")
         told = {"truncated": is_over and not terminated} if "truncated" in takes else {}
         self.agent.learn(obs, self._action, reward, next_obs, terminated, **told)
@@ -178,13 +164,10 @@ class PlainAgent(OnlineAlgorithm):
             return ""
         return "act draws at random or remembers (see values and explore in docs/own-agent.md)"
 
-    # --- files ------------------------------------------------------------------------------------
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "agent", "_judged", "_action"]
+    # --- files: the state as data where it can be, else as a pickle with the user's signature -----
 
     def save(self, *a: Any, **kw: Any) -> None:
-        """Write the zip: the agent's state as data, or as a pickle with the user's signature."""
+        """As of every agent."""
         self.state = self._state()
         super().save(*a, **kw)
         self.state = {}
@@ -194,14 +177,11 @@ class PlainAgent(OnlineAlgorithm):
             return {"state_dict": dict(self.agent.state_dict())}
         found = self.agent.__getstate__() or {}
         if isinstance(found, dict) and not hasattr(self.plain, "__setstate__"):
-            kept = {n: value for n, value in found.items() if not isinstance(value, gym.Env)}
-            kept = {n: dict(v) if type(v) is defaultdict else v for n, v in kept.items()}
-            try:
-                model_files.encode(kept)
-                return {"attributes": kept}
-            except model_files.UnknownTypeError:
-                pass
-        content = model_files.signed(cloudpickle.dumps(self.agent))
+            with suppress(model_files.UnknownTypeError):
+                model_files.encode(found)
+                return {"attributes": found}
+        pickled = cloudpickle.dumps(self.agent)
+        content = hmac.digest(model_files.key_of_user(), pickled, "sha256") + pickled
         return {"pickle": base64.b64encode(content).decode()}
 
     @classmethod
@@ -210,21 +190,30 @@ class PlainAgent(OnlineAlgorithm):
         changed = {name: kw.pop(name) for name in hyperparameters_of(cls.plain) if name in kw}
         model = super().load(*a, **kw)
         kind, content = model.state.popitem()
-        if kind == "pickle":
-            pickled = model_files.verified(base64.b64decode(content))
-            model.agent, content = pickle.loads(pickled), {}  # noqa: S301  # signed
+        if kind == "attributes":
+            vars(model.agent).update(content)
         elif kind == "state_dict":
             model.agent.load_state_dict(content)
-            content = {}
+        else:
+            given, pickled = (part := base64.b64decode(content))[:32], part[32:]
+            if given != hmac.digest(model_files.key_of_user(), pickled, "sha256"):
+                raise ValueError("it holds a pickle, not signed with your key, which is not loaded")
+            model.agent = pickle.loads(pickled)  # noqa: S301  # signed
         if lacking := [name for name in changed if not hasattr(model.agent, name)]:
             raise ValueError(f"{cls.__name__} has no attribute {lacking[0]} to change")
-        for name, value in {**content, **changed}.items():
-            old = vars(model.agent).get(name)
-            factory = old.default_factory if isinstance(old, defaultdict) else None
-            setattr(model.agent, name, defaultdict(factory, value) if factory else value)
+        vars(model.agent).update(changed)
         model.hyperparams |= changed
         model._judged = None
         return model
+
+
+def rows_of(observations: Any) -> list[Any]:
+    """Each of n observations as its space has it, without the axis of length n."""
+    if isinstance(observations, dict):
+        columns = [np.asarray(column) for column in observations.values()]
+        return [dict(zip(observations, row, strict=True)) for row in zip(*columns, strict=True)]
+    found = np.asarray(observations)
+    return found.tolist() if found.ndim == 1 else [*found]
 
 
 @cache
@@ -232,7 +221,6 @@ def algorithm_of(plain: type) -> type[PlainAgent]:
     """The algorithm that trains agents of a plain class; its arguments are those of both."""
     own = {"plain": plain, "__module__": plain.__module__}
     made: Any = type(plain.__name__, (PlainAgent,), own)
-    every = {**made.__signature__.parameters, **hyperparameters_of(plain)}
-    every = {name: one.replace(kind=one.KEYWORD_ONLY) for name, one in every.items()}
-    made.__signature__ = inspect.Signature([*every.values()])
+    every = {**made.__signature__.parameters, **hyperparameters_of(plain)}.values()
+    made.__signature__ = inspect.Signature(sorted(every, key=lambda one: one.kind))
     return made  # type: ignore[no-any-return]

@@ -258,9 +258,10 @@ def shared(*names: str, **changes: Any) -> list[Flag]:
 def import_typed(args: argparse.Namespace) -> None:
     """Import the modules of ``--gym-packages``, ``--env module:Id-v0`` and ``--algo module:Class``.
 
-    ``args.env`` is one id, a list of ids, or None, and is left without modules.
+    ``args.env`` is one id, a list of ids, or None, and is left without modules; agents are named
+    ``module.Class``.
     """
-    from rl_yardstick.pipeline.components import import_modules, module_name, split_class, split_id
+    from rl_yardstick.pipeline.components import agent_name, import_modules, split_class, split_id
 
     env = getattr(args, "env", None)
     ids = env if isinstance(env, list) else [env or ""]
@@ -268,13 +269,12 @@ def import_typed(args: argparse.Namespace) -> None:
     args.gym_packages = [*args.gym_packages, *(module for module, _ in found if module)]
     names = [name for _, name in found]
     args.env = names if isinstance(env, list) else names[0]
-    for key in ("algo", "algos"):
-        given = getattr(args, key, None)
-        words = given if isinstance(given, list) else [given] if given else []
-        own = [word for word in words if split_class(word)[2]]
-        args.gym_packages += [word for word in own if word not in args.gym_packages]
-        words = [f"{module_name(w)}:{split_class(w)[2]}" if w in own else w for w in words]
-        setattr(args, key, words if isinstance(given, list) else words[0] if words else given)
+    for key in [key for key in ("algo", "algos") if getattr(args, key, None)]:
+        algos = getattr(args, key)
+        words = algos if isinstance(algos, list) else [algos]
+        args.gym_packages += [word for word in words if split_class(word)[1]]
+        names = [agent_name(word) if split_class(word)[1] else word for word in words]
+        setattr(args, key, names if isinstance(algos, list) else names[0])
     import_modules(args.gym_packages)
 
 

@@ -271,9 +271,7 @@ def newest_run(args: argparse.Namespace, fits: Callable[[Run], bool]) -> Path | 
     """The newest run of ``--algo`` and ``--env`` that fits."""
     from rl_yardstick.pipeline.run import Run, numbered_runs
 
-    runs = numbered_runs(
-        Path(args.log_folder) / args.algo.replace(":", "_"), args.env.replace("/", "-")
-    )
+    runs = numbered_runs(Path(args.log_folder) / args.algo, args.env.replace("/", "-"))
     return next((path for _, path in reversed(runs) if fits(Run(path))), None)
 
 

@@ -105,11 +105,7 @@ def model_of_run(run: Run, which: Which = "final") -> Model:
 def _find_run(wanted: Wanted) -> Path:
     """The folder of a run by its number; 0: the newest, -1: the one without a number."""
     algo, env_id = wanted.algo or "ppo", wanted.env_id or "CartPole-v1"
-    folder, name, number = (
-        wanted.log_folder / algo.replace(":", "_"),
-        env_id.replace("/", "-"),
-        wanted.number,
-    )
+    folder, name, number = wanted.log_folder / algo, env_id.replace("/", "-"), wanted.number
     runs = dict(numbered_runs(folder, name))
     if number < 0 or (not runs and (folder / f"{name}.zip").exists()):
         return folder

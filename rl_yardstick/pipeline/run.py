@@ -74,7 +74,7 @@ class Run:
     @classmethod
     def claim(cls, folder: Path, spec: TrainSpec, suffix: str = "", **kwargs: Any) -> Self:
         """Make the next free folder of an agent on an environment; ``mkdir`` decides who has it."""
-        parent = folder / spec.algo_name
+        parent = folder / spec.algo
         parent.mkdir(parents=True, exist_ok=True)
         number = max((n for n, _ in numbered_runs(parent, spec.env_name)), default=0)
         while True:

@@ -245,8 +245,6 @@ def training_follows(
 def check_agent(algo: str) -> None:
     """Raise UserError if there is no such agent, or a package that it needs is missing."""
     entry = ALGORITHMS.get(algo)
-    if entry is None and ":" in algo:
-        raise UserError(f"{algo}: add --gym-packages {algo}")
     if entry is None:
         raise unknown("unknown agent", algo, ALGORITHMS)
     if not entry.is_installed:

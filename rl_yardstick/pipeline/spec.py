@@ -75,11 +75,6 @@ class TrainSpec(BaseModel):
         return portable_name(self.env_id.replace("/", "-"))
 
     @property
-    def algo_name(self) -> str:
-        """The agent as the name of a folder."""
-        return self.algo.replace(":", "_")
-
-    @property
     def place(self) -> str:
         """The environment for titles, with the file of its map."""
         return f"{self.env_name} ({self.map_name})" if self.map_name else self.env_name

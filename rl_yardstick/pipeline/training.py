@@ -175,7 +175,7 @@ class Training:
                 agent.learn(
                     spec.total_timesteps,
                     callback=self.callback,
-                    tb_log_name=spec.algo_name,
+                    tb_log_name=spec.algo,
                     reset_num_timesteps=spec.trained_agent is None,
                     **({} if interval == -1 and is_read else kwargs),
                 )
@@ -262,7 +262,7 @@ def make_agent(spec: TrainSpec, folder: Path | None, appending: bool = False) ->
     if log is None and not spec.library_log:
         agent.set_logger(Logger(folder=None, output_formats=[]))
     elif log is not None and appending:
-        newest = max(log.glob(f"{spec.algo_name}_*"), key=lambda p: p.stat().st_mtime, default=None)
+        newest = max(log.glob(f"{spec.algo}_*"), key=lambda p: p.stat().st_mtime, default=None)
         if newest is not None:  # the library would begin another log
             agent.set_logger(configure(str(newest), ["tensorboard"]))
     # The library seeds environment i with seed + i, so neighbouring seeds would share most.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hmac
 import io
 import json
 import os
@@ -394,23 +393,8 @@ def _zipped(data: Mapping[str, Any], params: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-# --- the user's signature -------------------------------------------------------------------------
-
-
-def signed(content: bytes) -> bytes:
-    """A pickle behind this user's signature, without which none is loaded."""
-    return hmac.digest(_key(), content, "sha256") + content
-
-
-def verified(content: bytes) -> bytes:
-    """The pickle of `signed`; UnsafeFileError if the signature is not this user's."""
-    if not hmac.compare_digest(content[:32], hmac.digest(_key(), content[32:], "sha256")):
-        raise UnsafeFileError("is not signed with your key: a state of others is not loaded")
-    return content[32:]
-
-
-def _key() -> bytes:
-    """This user's key, made on first use."""
+def key_of_user() -> bytes:
+    """The key with which this user signs pickles, made on first use."""
     folder = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "yardstick"
     path = folder / "state.key"
     if not path.exists():
