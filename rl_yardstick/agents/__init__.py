@@ -4,12 +4,12 @@ Importing this package loads neither torch nor Stable-Baselines3, so that names 
 spaces compared quickly.
 """
 
-from rl_yardstick.agents.own_classes import name_of
 from rl_yardstick.agents.registry import (
     ALGORITHMS,
     AlgorithmEntry,
     fitting_algorithms,
     load_algorithm,
+    name_of,
     register,
 )
 

@@ -10,8 +10,6 @@ from functools import cache
 from types import FunctionType
 from typing import Any
 
-from rl_yardstick.agents.registry import ALGORITHMS, BY_VALUE, DISCRETE, AlgorithmEntry
-
 SMALLEST = """\
 the smallest class that works:
 class MyAgent:
@@ -24,9 +22,9 @@ GIVEN = ("observation_space", "action_space", "n_states", "n_actions", "seed", "
 # What is given to methods, and the usual names of the arguments of ``learn`` in their order.
 _METHODS = {"act": "obs", "learn": "obs action reward next_obs terminated"}
 _METHODS |= {"reset": "", "values": "obs"}
-_NAMES = ("obs observation state s", "action a", "reward r")
-_NAMES += ("next_obs next_observation next_state new_obs new_state", "terminated terminal done")
-_PLACES = {name: place for place, names in enumerate(_NAMES) for name in names.split()}
+_NAMES = "obs observation state s, action a, reward r, next_obs next_observation next_state new_obs"
+_NAMES += " new_state, terminated terminal done"
+_PLACES = {name: place for place, names in enumerate(_NAMES.split(",")) for name in names.split()}
 
 
 def is_plain(cls: Any) -> bool:
@@ -36,14 +34,14 @@ def is_plain(cls: Any) -> bool:
 
 def fault_of(cls: Any) -> str:
     """Why an object is no class that can be trained; empty if it is one."""
-    if not isinstance(cls, type):
+    if not inspect.isclass(cls):
         return f"is no class, but of type {type(cls).__name__}"
     lacks = [name for name in ("act", "learn") if not callable(getattr(cls, name, None))]
     if is_plain(cls) and lacks:
         has = [name for name in dir(cls) if not name.startswith("_")]
         return f"lacks {' and '.join(lacks)}; it has {', '.join(has) or 'no methods'}"
     if inspect.isabstract(cls):
-        return f"is abstract: it lacks {', '.join(sorted(cls.__abstractmethods__))}"
+        return f"is abstract: it lacks {', '.join(sorted(vars(cls)['__abstractmethods__']))}"
     for name in [name for name in _METHODS if is_plain(cls) and hasattr(cls, name)]:
         known, given = parameters_of(cls, name), _METHODS[name].split()
         signature, wanted = inspect.Signature([*known.values()]), ", ".join(given)
@@ -78,27 +76,3 @@ def hyperparameters_of(cls: type) -> dict[str, inspect.Parameter]:
             kind: Any = int | float if is_number else one.annotation
             found[name] = one.replace(kind=one.KEYWORD_ONLY, annotation=kind)
     return found
-
-
-def add_class(name: str, cls: Any) -> None:
-    """Put a class into the registry; ValueError if it is none that can be trained."""
-    if fault := fault_of(cls):
-        raise ValueError(f"{name} {fault}")
-    takes = parameters_of(cls) if is_plain(cls) else {}
-    known = (DISCRETE if word in takes else () for word in ("n_states", "n_actions"))
-    ALGORITHMS[name] = AlgorithmEntry(f"{cls.__module__}:{cls.__name__}", cls.__name__, *known)
-
-
-def name_of(cls: type) -> str:
-    """Register a class itself, such as one of a notebook's cell, and return the agent's name.
-
-    Processes that train in parallel get it by value. It replaces a class that was registered here
-    under the same name. Raises ValueError if it cannot be trained, or a shipped agent has its name.
-    """
-    name, module = (getattr(cls, key, str(cls)) for key in ("__name__", "__module__"))
-    name = name if module == "__main__" else f"{module}.{name}"
-    if name not in BY_VALUE and name.lower() in map(str.lower, ALGORITHMS) and "." not in name:
-        raise ValueError(f"there is an agent {name.lower()} already: give the class another name")
-    add_class(name, cls)
-    BY_VALUE[name] = cls
-    return name

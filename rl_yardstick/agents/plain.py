@@ -58,13 +58,13 @@ class PlainAgent(OnlineAlgorithm):
         self.state: dict[str, Any] = {}  # of the agent, in a zip
         self._judged: Any = None  # a copy of the agent, until that learns on
         super().__init__(policy, *a, **kw)
-        if self.n_envs != 1 and kw.get("_init_setup_model", True):
+        if kw.get("_init_setup_model", True) and self.n_envs != 1:
             raise ValueError("it learns from one environment at a time: n_envs must be 1")
 
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.policy = self.policy_class(self.observation_space, self.action_space)
+        self.policy = PlainPolicy(self.observation_space, self.action_space)
         self.policy.owner = self
         self.agent = self._made()
         self._judged, _ = deepcopy(self.agent), self._state()  # what fails, fails at the start
@@ -102,7 +102,7 @@ class PlainAgent(OnlineAlgorithm):
         values = self.values_at(rows)
         if values is None or values.ndim == 1:
             return None
-        return (values.argmax(axis=1) + getattr(self.action_space, "start", 0)).tolist()
+        return [*(values.argmax(axis=1) + getattr(self.action_space, "start", 0)).tolist()]
 
     def values_at(self, rows: list[Any]) -> Floats | None:
         """Its values at n observations, shape (n, A) or (n,); None without ``values``."""
@@ -143,15 +143,17 @@ class PlainAgent(OnlineAlgorithm):
         if hasattr(self.plain, "reset"):
             self.agent.reset()
 
-    def predict(self, obs: Any, state: Any = None, start: Any = None, *a: Any, **kw: Any) -> Any:
+    def predict(  # type: ignore[override]  # the rest goes through
+        self, observation: Any, state: Any = None, episode_start: Any = None, *a: Any, **kw: Any
+    ) -> Any:
         """As in the library; ``reset`` is called where an episode starts."""
-        start = kw.pop("episode_start", start)
+        start = episode_start
         if start is not None and hasattr(self.plain, "reset"):
             if len(start) > 1:
                 raise ValueError("an agent with reset() plays one environment at a time")
             if start[0]:
                 self.judged.reset()
-        return super().predict(obs, state, start, *a, **kw)
+        return super().predict(observation, state, start, *a, **kw)
 
     def why_not_exact(self, observations: NDArray[Any]) -> str:
         """Why its greedy actions are no function of observations; empty if they are one."""

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium import spaces
 
+from rl_yardstick.agents.own_classes import fault_of, is_plain, parameters_of
+
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -284,7 +286,7 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
 }
 
 
-BY_VALUE: dict[str, type] = {}  # classes that `own_classes.name_of` has registered
+BY_VALUE: dict[str, type] = {}  # classes that `name_of` has registered
 
 
 def register(name: str, entry_point: str, **fields: Any) -> None:
@@ -335,6 +337,34 @@ def _space_names(name: str, role: str, given: Any) -> tuple[str, ...]:
     return names
 
 
+def add_class(name: str, cls: Any) -> None:
+    """Put a class into the registry; ValueError if it is none that can be trained."""
+    if fault := fault_of(cls):
+        raise ValueError(f"{name} {fault}")
+    kinds: dict[str, tuple[str, ...]] = {}
+    if is_plain(cls):
+        takes = parameters_of(cls)
+        kinds["observations"] = DISCRETE if "n_states" in takes else NETWORK_INPUTS
+        kinds["actions"] = DISCRETE if "n_actions" in takes else POLICY_GRADIENT_OUTPUTS
+    place = f"{cls.__module__}:{cls.__name__}"
+    ALGORITHMS[name] = AlgorithmEntry(place, cls.__name__, **kinds)  # type: ignore[arg-type]
+
+
+def name_of(cls: type) -> str:
+    """Register a class itself, such as one of a notebook's cell, and return the agent's name.
+
+    Processes that train in parallel get it by value. It replaces a class that was registered here
+    under the same name. Raises ValueError if it cannot be trained, or a shipped agent has its name.
+    """
+    name, module = (getattr(cls, key, str(cls)) for key in ("__name__", "__module__"))
+    name = name if module == "__main__" else f"{module}.{name}"
+    if name not in BY_VALUE and name.lower() in map(str.lower, ALGORITHMS) and "." not in name:
+        raise ValueError(f"there is an agent {name.lower()} already: give the class another name")
+    add_class(name, cls)
+    BY_VALUE[name] = cls
+    return name
+
+
 def load_algorithm(name: str) -> type[BaseAlgorithm]:
     """Import the class of the agent ``name``; for a plain class, the algorithm that trains it.
 
@@ -343,8 +373,6 @@ def load_algorithm(name: str) -> type[BaseAlgorithm]:
         ModuleNotFoundError: if the optional package that it needs is missing.
         ValueError: if there is no such class, or it cannot be trained.
     """
-    from rl_yardstick.agents.own_classes import fault_of, is_plain
-
     entry_point = ALGORITHMS[name].entry_point
     module_name, class_name = entry_point.split(":")
     found: Any = BY_VALUE.get(name) or getattr(

@@ -233,6 +233,8 @@ class ClassSubject(Subject):
             raise UserError(f"--algo {name}: it does not learn")
         self.cls: Any = load_algorithm(name)
         self.parameters = constructor_parameters(self.cls)
+        if hasattr(self.cls, "plain") and "gamma" not in self.parameters:
+            raise UserError(f"--algo {name}: its constructor must take gamma, which probes set")
         known = arguments_of(name)
         for key in typed:
             if key not in known:

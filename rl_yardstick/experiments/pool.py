@@ -24,8 +24,7 @@ from pebble import ProcessExpired, ProcessPool
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from rl_yardstick.agents.own_classes import name_of
-from rl_yardstick.agents.registry import BY_VALUE
+from rl_yardstick.agents.registry import BY_VALUE, name_of
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line

@@ -27,8 +27,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from rl_yardstick.agents.own_classes import SMALLEST, add_class
-from rl_yardstick.agents.registry import BY_VALUE
+from rl_yardstick.agents.own_classes import SMALLEST
+from rl_yardstick.agents.registry import BY_VALUE, add_class
 from rl_yardstick.pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
