@@ -34,7 +34,7 @@ def is_plain(cls: Any) -> bool:
 
 def fault_of(cls: Any) -> str:
     """Why an object is no class that can be trained; empty if it is one."""
-    if not inspect.isclass(cls):
+    if not isinstance(cls, type):
         return f"is no class, but of type {type(cls).__name__}"
     lacks = [name for name in ("act", "learn") if not callable(getattr(cls, name, None))]
     if is_plain(cls) and lacks:
@@ -49,8 +49,8 @@ def fault_of(cls: Any) -> str:
             signature.bind(*given, **dict.fromkeys(known.keys() & {"explore", "truncated"}, True))
         except TypeError:
             return f"has {name}{signature}, which does not take ({wanted})"
-        told = [*known][: len(given)] if name == "learn" else []
-        if any(_PLACES.get(word, place) != place for place, word in enumerate(told)):
+        told = enumerate([*known][: len(given)] if name == "learn" else ())
+        if any(_PLACES.get(word, place) != place for place, word in told):
             return f"has {name}{signature}, whose order must be ({wanted})"
     return ""
 

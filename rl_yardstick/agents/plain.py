@@ -81,9 +81,6 @@ class PlainAgent(OnlineAlgorithm):
         given = {"observation_space": seen, "action_space": done, "seed": self.seed, "env": outside}
         given |= {"n_states": getattr(seen, "n", None), "n_actions": getattr(done, "n", None)}
         kept = {name: given[name] for name in given if name in parameters_of(self.plain)}
-        own = {n: p.default for n, p in hyperparameters_of(self.plain).items()} | self.hyperparams
-        if lacking := [name for name in own if own[name] is inspect.Parameter.empty]:
-            raise ValueError(f"it needs {', '.join(lacking)}: -params {lacking[0]}:VALUE")
         return self.plain(**kept, **self.hyperparams)
 
     # --- acting and learning ----------------------------------------------------------------------
@@ -143,17 +140,16 @@ class PlainAgent(OnlineAlgorithm):
         if hasattr(self.plain, "reset"):
             self.agent.reset()
 
-    def predict(  # type: ignore[override]  # the rest goes through
+    def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, *a: Any, **kw: Any
     ) -> Any:
         """As in the library; ``reset`` is called where an episode starts."""
-        start = episode_start
-        if start is not None and hasattr(self.plain, "reset"):
-            if len(start) > 1:
+        if episode_start is not None and hasattr(self.plain, "reset"):
+            if len(episode_start) > 1:
                 raise ValueError("an agent with reset() plays one environment at a time")
-            if start[0]:
+            if episode_start[0]:
                 self.judged.reset()
-        return super().predict(observation, state, start, *a, **kw)
+        return super().predict(observation, state, episode_start, *a, **kw)
 
     def why_not_exact(self, observations: NDArray[Any]) -> str:
         """Why its greedy actions are no function of observations; empty if they are one."""
@@ -188,8 +184,7 @@ class PlainAgent(OnlineAlgorithm):
 
     @classmethod
     def load(cls, *a: Any, **kw: Any) -> Self:
-        """As of every agent; hyperparameters among the keywords change attributes of that name."""
-        changed = {name: kw.pop(name) for name in hyperparameters_of(cls.plain) if name in kw}
+        """As of every agent."""
         model = super().load(*a, **kw)
         kind, content = model.state.popitem()
         if kind == "attributes":
@@ -201,10 +196,6 @@ class PlainAgent(OnlineAlgorithm):
             if given != hmac.digest(model_files.key_of_user(), pickled, "sha256"):
                 raise ValueError("it holds a pickle, not signed with your key, which is not loaded")
             model.agent = pickle.loads(pickled)  # noqa: S301  # signed
-        if lacking := [name for name in changed if not hasattr(model.agent, name)]:
-            raise ValueError(f"{cls.__name__} has no attribute {lacking[0]} to change")
-        vars(model.agent).update(changed)
-        model.hyperparams |= changed
         model._judged = None
         return model
 

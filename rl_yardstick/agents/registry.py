@@ -341,24 +341,24 @@ def add_class(name: str, cls: Any) -> None:
     """Put a class into the registry; ValueError if it is none that can be trained."""
     if fault := fault_of(cls):
         raise ValueError(f"{name} {fault}")
-    kinds: dict[str, tuple[str, ...]] = {}
-    if is_plain(cls):
-        takes = parameters_of(cls)
-        kinds["observations"] = DISCRETE if "n_states" in takes else NETWORK_INPUTS
-        kinds["actions"] = DISCRETE if "n_actions" in takes else POLICY_GRADIENT_OUTPUTS
-    place = f"{cls.__module__}:{cls.__name__}"
-    ALGORITHMS[name] = AlgorithmEntry(place, cls.__name__, **kinds)  # type: ignore[arg-type]
+    takes = parameters_of(cls)
+    seen = DISCRETE if "n_states" in takes else NETWORK_INPUTS
+    done = DISCRETE if "n_actions" in takes else POLICY_GRADIENT_OUTPUTS
+    kinds: Any = (seen, done) if is_plain(cls) else ()
+    module, _, own = name.rpartition(".")
+    ALGORITHMS[name] = AlgorithmEntry(f"{module or '__main__'}:{own}", own, *kinds)
 
 
 def name_of(cls: type) -> str:
     """Register a class itself, such as one of a notebook's cell, and return the agent's name.
 
-    Processes that train in parallel get it by value. It replaces a class that was registered here
-    under the same name. Raises ValueError if it cannot be trained, or a shipped agent has its name.
+    It replaces one of the same name that was registered here. Processes that train in parallel get
+    it by value. Raises ValueError if it cannot be trained, or a shipped agent has its name.
     """
     name, module = (getattr(cls, key, str(cls)) for key in ("__name__", "__module__"))
     name = name if module == "__main__" else f"{module}.{name}"
-    if name not in BY_VALUE and name.lower() in map(str.lower, ALGORITHMS) and "." not in name:
+    taken = {known.lower() for known in ALGORITHMS if known not in BY_VALUE}
+    if "." not in name and name.lower() in taken:
         raise ValueError(f"there is an agent {name.lower()} already: give the class another name")
     add_class(name, cls)
     BY_VALUE[name] = cls

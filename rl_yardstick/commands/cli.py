@@ -261,7 +261,7 @@ def import_typed(args: argparse.Namespace) -> None:
     ``args.env`` is one id, a list of ids, or None, and is left without modules; agents are named
     ``module.Class``.
     """
-    from rl_yardstick.pipeline.components import agent_name, import_modules, split_class, split_id
+    from rl_yardstick.pipeline.components import agent_name, import_modules, split_id
 
     env = getattr(args, "env", None)
     ids = env if isinstance(env, list) else [env or ""]
@@ -272,8 +272,8 @@ def import_typed(args: argparse.Namespace) -> None:
     for key in [key for key in ("algo", "algos") if getattr(args, key, None)]:
         algos = getattr(args, key)
         words = algos if isinstance(algos, list) else [algos]
-        args.gym_packages += [word for word in words if split_class(word)[1]]
-        names = [agent_name(word) if split_class(word)[1] else word for word in words]
+        args.gym_packages += [word for word in words if ":" in word]
+        names = [*map(agent_name, words)]
         setattr(args, key, names if isinstance(algos, list) else names[0])
     import_modules(args.gym_packages)
 

@@ -165,10 +165,7 @@ def process_pool(n_workers: int) -> ProcessPool:
 
 
 def _start(classes: bytes) -> None:
-    """Let a worker end with the command that started it, also after a SIGKILL.
-
-    ``classes`` are those of the user that it cannot import.
-    """
+    """Let a worker know the user's classes, and end with its command, also after a SIGKILL."""
     for cls in pickle.loads(classes).values():  # noqa: S301  # from the command's memory
         name_of(cls)
     parent, leave = multiprocessing.parent_process(), os._exit

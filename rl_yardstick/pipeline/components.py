@@ -98,7 +98,7 @@ def _register(typed: str, cls: str, inside: dict[str, Any]) -> None:
     try:
         add_class(agent_name(typed), inside[cls])
     except ValueError as error:
-        raise UserError(str(error), SMALLEST) from error
+        raise UserError(str(error), SMALLEST if isinstance(inside[cls], type) else "") from error
 
 
 def _import_file(path: Path) -> None:
