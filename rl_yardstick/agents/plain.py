@@ -64,16 +64,12 @@ class PlainAgent(OnlineAlgorithm):
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
+        if self.seed is not None:
+            set_random_seed(self.seed)  # the global generators, which the user's class may use
         self.policy = PlainPolicy(self.observation_space, self.action_space)
         self.policy.owner = self
         self.agent = self._made()
         self._judged, _ = deepcopy(self.agent), self._state()  # what fails, fails at the start
-
-    def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed all generators, also the global ones, which the user's class may use."""
-        super().set_random_seed(seed)
-        if seed is not None:
-            set_random_seed(seed)
 
     def _made(self) -> Any:
         seen, done, outside = self.observation_space, self.action_space, gym.Env[Any, Any]()
@@ -193,7 +189,8 @@ class PlainAgent(OnlineAlgorithm):
             model.agent.load_state_dict(content)
         else:
             given, pickled = (part := base64.b64decode(content))[:32], part[32:]
-            if given != hmac.digest(model_files.key_of_user(), pickled, "sha256"):
+            wanted = hmac.digest(model_files.key_of_user(), pickled, "sha256")
+            if not hmac.compare_digest(given, wanted):
                 raise ValueError("it holds a pickle, not signed with your key, which is not loaded")
             model.agent = pickle.loads(pickled)  # noqa: S301  # signed
         model._judged = None
