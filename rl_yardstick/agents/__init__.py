@@ -9,7 +9,9 @@ from rl_yardstick.agents.registry import (
     AlgorithmEntry,
     fitting_algorithms,
     load_algorithm,
+    name_of,
     register,
 )
 
-__all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm", "register"]
+__all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm"]
+__all__ += ["name_of", "register"]

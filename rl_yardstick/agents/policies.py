@@ -21,6 +21,7 @@ from rl_yardstick.agents.bandits.tables import ValueBandit
 from rl_yardstick.agents.common.exploration import BOLTZMANN
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm, tiles_of_all, vectors_of
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
+from rl_yardstick.agents.plain import PlainAgent, rows_of
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
@@ -95,6 +96,8 @@ def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
     if is_of_library(type(agent).__module__):
         return ""
     try:
+        if isinstance(agent, PlainAgent):
+            return agent.why_not_exact(observations)
         asked = [agent.predict(observations, deterministic=True) for _ in range(2)]
         first, second = (np.asarray(actions) for actions, _ in asked)
     except Exception as error:  # noqa: BLE001  # a stranger's code can fail in any way
@@ -259,6 +262,8 @@ def own_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | Non
     ``observations`` has the states along its first axis.
     """
     policy: Any = agent.policy
+    if isinstance(agent, PlainAgent):
+        return agent.values_at(rows_of(observations))
     if isinstance(agent, TabularAlgorithm):
         return np.asarray(policy.q_table[observations])
     if isinstance(agent, SoftmaxAlgorithm):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium import spaces
 
+from rl_yardstick.agents.own_classes import fault_of, is_plain, parameters_of
 from rl_yardstick.envs.finite_spaces import bijection_of, counts_from_zero, table_size
 
 if TYPE_CHECKING:
@@ -300,6 +301,9 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
 }
 
 
+BY_VALUE: dict[str, type] = {}  # classes that `name_of` has registered
+
+
 def register(name: str, entry_point: str, **fields: Any) -> None:
     """Add an agent of your own to the registry, so that the commands find it.
 
@@ -308,7 +312,8 @@ def register(name: str, entry_point: str, **fields: Any) -> None:
 
     Args:
         name: the value of ``--algo``.
-        entry_point: the class, a subclass of `BaseAlgorithm`, as ``"module:Class"``.
+        entry_point: the class, a subclass of `BaseAlgorithm` or a plain one with ``act`` and
+            ``learn``, as ``"module:Class"``.
         fields: further attributes of `AlgorithmEntry`, each with its default: ``summary`` (the
             class's name), ``observations`` and ``actions`` (any space), ``observation_shape``,
             ``for_bandits``, ``needs_masks``, ``has_memory``, ``package``, ``extra`` and
@@ -347,23 +352,54 @@ def _space_names(name: str, role: str, given: Any) -> tuple[str, ...]:
     return names
 
 
+def add_class(name: str, cls: Any) -> None:
+    """Put a class into the registry; ValueError if it is none that can be trained."""
+    if fault := fault_of(cls):
+        raise ValueError(f"{name} {fault}")
+    takes = parameters_of(cls)
+    seen = DISCRETE if "n_states" in takes else NETWORK_INPUTS
+    done = DISCRETE if "n_actions" in takes else POLICY_GRADIENT_OUTPUTS
+    kinds: Any = (seen, done) if is_plain(cls) else ()
+    module, _, own = name.rpartition(".")
+    ALGORITHMS[name] = AlgorithmEntry(f"{module or '__main__'}:{own}", own, *kinds)
+
+
+def name_of(cls: type) -> str:
+    """Register a class itself, such as one of a notebook's cell, and return the agent's name.
+
+    It replaces one of the same name that was registered here. Processes that train in parallel get
+    it by value. Raises ValueError if it cannot be trained, or a shipped agent has its name.
+    """
+    name, module = (getattr(cls, key, str(cls)) for key in ("__name__", "__module__"))
+    name = name if module == "__main__" else f"{module}.{name}"
+    taken = {known.lower() for known in ALGORITHMS if known not in BY_VALUE}
+    if "." not in name and name.lower() in taken:
+        raise ValueError(f"there is an agent {name.lower()} already: give the class another name")
+    add_class(name, cls)
+    BY_VALUE[name] = cls
+    return name
+
+
 def load_algorithm(name: str) -> type[BaseAlgorithm]:
-    """Import the class of the agent ``name``.
+    """Import the class of the agent ``name``; for a plain class, the algorithm that trains it.
 
     Raises:
         KeyError: if there is no agent of that name.
         ModuleNotFoundError: if the optional package that it needs is missing.
-        ValueError: if there is no such class, or it is no subclass of `BaseAlgorithm`.
+        ValueError: if there is no such class, or it cannot be trained.
     """
-    from stable_baselines3.common.base_class import BaseAlgorithm
-
     entry_point = ALGORITHMS[name].entry_point
     module_name, class_name = entry_point.split(":")
-    algorithm = getattr(importlib.import_module(module_name), class_name, None)
-    if not (isinstance(algorithm, type) and issubclass(algorithm, BaseAlgorithm)):
-        fault = "does not exist" if algorithm is None else "is no subclass of BaseAlgorithm"
+    found: Any = BY_VALUE.get(name) or getattr(
+        importlib.import_module(module_name), class_name, None
+    )
+    if fault := "does not exist" if found is None else fault_of(found):
         raise ValueError(f"{name} is registered as {entry_point}, which {fault}")
-    return algorithm
+    if is_plain(found):
+        from rl_yardstick.agents.plain import algorithm_of
+
+        found = algorithm_of(found)
+    return found  # type: ignore[no-any-return]
 
 
 def fitting_algorithms(

@@ -73,10 +73,11 @@ def _exit_code(name: str) -> int:
 
     from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, visible
 
+    example = ""
     try:
         return int(import_module(f"rl_yardstick.commands.{name}").main() or 0)
     except UserError as error:
-        message = str(error)
+        message, example = str(error), error.example
     except BrokenPipeError:  # such as ``| head``
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -96,4 +97,6 @@ def _exit_code(name: str) -> int:
         traceback.print_exc()
         return 1
     print(f"{os.path.basename(sys.argv[0])}: error: {visible(message)}", file=sys.stderr)  # noqa: PTH119, T201
+    if example:
+        print(example, file=sys.stderr)  # noqa: T201
     return MISTAKE

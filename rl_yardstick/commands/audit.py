@@ -6,6 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
+from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, shared, whole_number, with_engine
 from rl_yardstick.diagnosis.faults import FAULTS, KINDS
 from rl_yardstick.pipeline.errors import UserError
@@ -78,25 +79,25 @@ def main() -> int:
 
 def _subject(args: argparse.Namespace) -> Subject:
     """The algorithm that the arguments select; imports its module."""
-    from rl_yardstick.pipeline.components import import_modules
     from rl_yardstick.pipeline.settings import check_agent, parse_assignments
 
-    name = args.algo or args.script
-    module, colon, attribute = name.rpartition(":")
-    import_modules([*args.gym_packages, *filter(None, [module])])
-    from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject, register_class
+    module, _, attribute = (args.script or "").rpartition(":")
+    args.gym_packages += [module] if module else []
+    cli.import_typed(args)
+    from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject
 
     typed: dict[str, Any] = parse_assignments(args.hyperparams, "-params")
     wanted = args.observations, args.actions
     if args.script is None:
-        register_class(name) if colon else check_agent(name)
-        return ClassSubject(name, with_engine(name, typed, args.engine), args.kind, wanted)
+        check_agent(args.algo)
+        typed = with_engine(args.algo, typed, args.engine)
+        return ClassSubject(args.algo, typed, args.kind, wanted)
     function = getattr(sys.modules.get(module), attribute, None)
     if not callable(function):
-        raise UserError(f"--script takes module:function, and there is no function {name}")
+        raise UserError(f"--script takes module:function, and there is no function {args.script}")
     if args.engine is not None:
         raise UserError("--engine: a script has none")
-    return ScriptSubject(name, function, typed, args.kind, wanted)
+    return ScriptSubject(args.script, function, typed, args.kind, wanted)
 
 
 def verdict_lines(verdict: Verdict) -> list[str]:

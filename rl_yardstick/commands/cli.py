@@ -256,17 +256,25 @@ def shared(*names: str, **changes: Any) -> list[Flag]:
 
 
 def import_typed(args: argparse.Namespace) -> None:
-    """Import the modules of ``--gym-packages`` and of ``--env module:Id-v0``, and drop the latter.
+    """Import the modules of ``--gym-packages``, ``--env module:Id-v0`` and ``--algo module:Class``.
 
-    ``args.env`` is one id, a list of ids, or None.
+    ``args.env`` is one id, a list of ids, or None, and is left without modules; agents are named
+    ``module.Class``.
     """
-    from rl_yardstick.pipeline.components import import_modules, split_id
+    from rl_yardstick.pipeline.components import agent_name, import_modules, split_id
 
-    ids = args.env if isinstance(args.env, list) else [args.env or ""]
+    env = getattr(args, "env", None)
+    ids = env if isinstance(env, list) else [env or ""]
     found = [split_id(env_id) for env_id in ids]
     args.gym_packages = [*args.gym_packages, *(module for module, _ in found if module)]
     names = [name for _, name in found]
-    args.env = names if isinstance(args.env, list) else names[0]
+    args.env = names if isinstance(env, list) else names[0]
+    for key in [key for key in ("algo", "algos") if getattr(args, key, None)]:
+        algos = getattr(args, key)
+        words = algos if isinstance(algos, list) else [algos]
+        args.gym_packages += [word for word in words if ":" in word]
+        names = [*map(agent_name, words)]
+        setattr(args, key, names if isinstance(algos, list) else names[0])
     import_modules(args.gym_packages)
 
 

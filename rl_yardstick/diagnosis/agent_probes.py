@@ -58,6 +58,7 @@ def _learning_rate(subject: Subject) -> float | None:
     """A constant learning rate that a schedule can replace; None without one."""
     rate = {**subject.base, **subject.typed}.get("learning_rate", 0.1)
     has_rate = subject.accepts("learning_rate") and isinstance(rate, float)
+    has_rate &= not hasattr(getattr(subject, "cls", None), "plain")  # a number alone
     return rate if has_rate and not subject.uses_ratio else None
 
 

@@ -162,7 +162,9 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
         UserError: where the agent's policy cannot be evaluated in all states, or the environment is
             too large.
     """
-    if reason := evaluator.obstacle(agent):
+    from rl_yardstick.agents.policies import why_not_exact
+
+    if reason := evaluator.obstacle(agent) or why_not_exact(agent, evaluator.observations):
         raise UserError(f"{spec.algo} cannot be explained: {reason}")
     policy = evaluator.policy(agent, deterministic=True)
     with closing(make_single_env(spec)) as env:

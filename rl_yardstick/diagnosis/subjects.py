@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rl_yardstick.agents.registry import ALGORITHMS, AlgorithmEntry, load_algorithm
+from rl_yardstick.agents.registry import ALGORITHMS, load_algorithm
 from rl_yardstick.diagnosis.faults import KINDS, Target
 from rl_yardstick.diagnosis.probe_worlds import (
     ProbeEnv,
@@ -234,6 +233,8 @@ class ClassSubject(Subject):
             raise UserError(f"--algo {name}: it does not learn")
         self.cls: Any = load_algorithm(name)
         self.parameters = constructor_parameters(self.cls)
+        if hasattr(self.cls, "plain") and "gamma" not in self.parameters:
+            raise UserError(f"--algo {name}: its constructor must take gamma, which probes set")
         known = arguments_of(name)
         for key in typed:
             if key not in known:
@@ -264,22 +265,6 @@ class ClassSubject(Subject):
         model = self.cls(env=env, **settings)
         model.set_logger(Logger(folder=None, output_formats=[]))
         return model
-
-
-def register_class(name: str) -> None:
-    """Register a class of the user, ``module:Class`` of a module that is imported."""
-    from stable_baselines3.common.base_class import BaseAlgorithm
-
-    module, _, attribute = name.rpartition(":")
-    found = getattr(sys.modules[module], attribute, None)
-    if found is None:
-        raise UserError(f"--algo {name}: {module} has no {attribute}")
-    if not (isinstance(found, type) and issubclass(found, BaseAlgorithm)):
-        raise UserError(
-            f"--algo {name}: {attribute} is no subclass of Stable-Baselines3's BaseAlgorithm; a "
-            f"function that trains is audited by --script {name}"
-        )
-    ALGORITHMS[name] = AlgorithmEntry(name, attribute)
 
 
 def values_of(model: Any, observations: list[Any]) -> Floats | None:

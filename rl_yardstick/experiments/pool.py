@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import shutil
 import signal
 import sys
@@ -13,15 +14,17 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager, suppress
-from functools import cache, partial
+from functools import cache
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any, Self
 
+import cloudpickle
 from pebble import ProcessExpired, ProcessPool
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from rl_yardstick.agents.registry import BY_VALUE, name_of
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line
@@ -157,11 +160,14 @@ def process_pool(n_workers: int) -> ProcessPool:
     context.set_forkserver_preload(["rl_yardstick.experiments.preloaded"])
     for library in ("OMP", "MKL", "OPENBLAS"):  # small networks are slower with more
         os.environ[f"{library}_NUM_THREADS"] = "1"
-    return ProcessPool(n_workers, initializer=_follow_parent, context=context)
+    classes = (cloudpickle.dumps(BY_VALUE),)
+    return ProcessPool(n_workers, initializer=_start, initargs=classes, context=context)
 
 
-def _follow_parent() -> None:
-    """Let a worker end with the command that started it, also after a SIGKILL."""
+def _start(classes: bytes) -> None:
+    """Let a worker know the user's classes, and end with its command, also after a SIGKILL."""
+    for cls in pickle.loads(classes).values():  # noqa: S301  # from the command's memory
+        name_of(cls)
     parent, leave = multiprocessing.parent_process(), os._exit
     assert parent is not None
     # The pool waits for ever for a process that ended with 0, as by os._exit in an environment.
@@ -176,10 +182,10 @@ def _follow_parent() -> None:
 
 def do_aside(function: Callable[..., Any], *args: Any) -> Any:
     """Call a function in a lasting process, so that this one need not import the libraries."""
-    return _aside().schedule(function, args=args).result()
+    return _aside(*BY_VALUE.values()).schedule(function, args=args).result()
 
 
-_aside = cache(partial(process_pool, 1))
+_aside = cache(lambda *classes: process_pool(1))
 
 
 # --- doing runs -----------------------------------------------------------------------------------

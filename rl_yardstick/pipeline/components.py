@@ -20,12 +20,15 @@ import sys
 import traceback
 import typing
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from rl_yardstick.agents.own_classes import SMALLEST
+from rl_yardstick.agents.registry import BY_VALUE, add_class
 from rl_yardstick.pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
@@ -56,19 +59,46 @@ def import_modules(typed: Iterable[str]) -> None:
     for name in typed:
         if str(Path.cwd()) not in sys.path[:1]:
             sys.path.insert(0, str(Path.cwd()))
+        module, cls = split_class(name)
         try:
-            if name.endswith(".py") or "/" in name:
-                _import_file(Path(name).expanduser())
+            if module.endswith(".py") or "/" in module:
+                _import_file(Path(module).expanduser())
             else:
-                importlib.import_module(name)
+                importlib.import_module(module)
+            if cls:
+                _register(name, cls, vars(sys.modules[module_name(name)]))
         except UserError:
             raise
         except ModuleNotFoundError as error:
-            raise UserError(f"--gym-packages {name}: no module named {error.name}") from error
+            hint = did_you_mean(name, [f"{path.stem}:{cls}" for path in Path().glob("*.py")])
+            fault = f"no module named {error.name}{f': {hint}' if cls and hint else ''}"
+            raise UserError(f"--gym-packages {name}: {fault}") from error
         except (Exception, SystemExit) as error:  # an import may raise anything
             last = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{last.filename}:{last.lineno}"
             raise UserError(f"--gym-packages {name}: {place}: {one_line(error)}") from error
+
+
+def split_class(typed: str) -> tuple[str, str]:
+    """The module or file, and the class, in ``module:Class``; without one, an empty text."""
+    module, _, cls = typed.rpartition(":")
+    return (module, cls) if module and cls.isidentifier() else (typed, "")
+
+
+def agent_name(typed: str) -> str:
+    """The name ``module.Class`` of an agent whose class is typed; or else that of the module."""
+    cls = split_class(typed)[1]
+    return f"{module_name(typed)}.{cls}" if cls else module_name(typed)
+
+
+def _register(typed: str, cls: str, inside: dict[str, Any]) -> None:
+    if cls not in inside:
+        known = [name for name, value in inside.items() if isinstance(value, type)]
+        raise unknown(f"{typed}: there is no class", cls, known)
+    try:
+        add_class(agent_name(typed), inside[cls])
+    except ValueError as error:
+        raise UserError(str(error), SMALLEST if isinstance(inside[cls], type) else "") from error
 
 
 def _import_file(path: Path) -> None:
@@ -87,12 +117,17 @@ def _import_file(path: Path) -> None:
 
 def module_name(typed: str) -> str:
     """The name under which `import_modules` has imported what was typed."""
-    return Path(typed).stem if typed.endswith(".py") or "/" in typed else typed
+    module, _ = split_class(typed)
+    return Path(module).stem if module.endswith(".py") or "/" in module else module
 
 
-def digests_of(typed: Iterable[str]) -> dict[str, str]:
-    """A digest of the sources of each imported module of the user, by its name."""
+def digests_of(typed: Iterable[str], algo: str = "") -> dict[str, str]:
+    """A digest of the sources of each imported module of the user, or of a given class, by name."""
     found = {}
+    with suppress(OSError):  # of a class that was typed into a console
+        methods = filter(inspect.isfunction, vars(BY_VALUE.get(algo, int)).values())
+        if source := "".join(map(inspect.getsource, methods)):
+            found[algo] = hashlib.sha256(source.encode()).hexdigest()[:12]
     for name in map(module_name, typed):
         file = Path(getattr(sys.modules.get(name), "__file__", None) or "")
         files = sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
@@ -116,8 +151,8 @@ def split_id(env_id: str) -> tuple[str, str]:
 
 def check_typed(recorded: Iterable[str], typed: Iterable[str], where: str) -> None:
     """Raise UserError if a module that a file names is missing among those that were typed."""
-    known = {module_name(name) for name in typed}
-    missing = [name for name in recorded if module_name(name) not in known]
+    known = {name(one) for one in typed for name in (agent_name, module_name)}
+    missing = [name for name in recorded if agent_name(name) not in known]
     if missing:
         what = f"was made with modules of yours: add --gym-packages {' '.join(missing)}"
         raise UserError(f"{where} {what}")

@@ -29,9 +29,13 @@ _OBEYED = re.compile(
 
 
 class UserError(Exception):
-    """A user error: one line that says what is wrong, where, and how to correct it."""
+    """A user error: one line that says what is wrong, where, and how to correct it.
 
-    def __init__(self, message: str) -> None:
+    ``example`` has lines to print below it.
+    """
+
+    def __init__(self, message: str, example: str = "") -> None:
+        self.example = example
         super().__init__(visible(" ".join(line.strip() for line in message.splitlines())))
 
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import yaml
 
+from rl_yardstick.agents.own_classes import SMALLEST, fault_of
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.pipeline.components import (
     AUTO,
@@ -251,12 +252,8 @@ def check_agent(algo: str) -> None:
         raise UserError(f"{algo} needs {fault}")
     module, _, name = entry.entry_point.partition(":")
     cls = getattr(sys.modules.get(module), name, None)  # imported already if it is the user's
-    bases = {base.__name__ for base in getattr(cls, "__mro__", ())}
-    if bases and "BaseAlgorithm" not in bases:
-        wanted = ("learn", "predict", "save", "load", "policy", "get_env")
-        missing = ", ".join(one for one in wanted if not hasattr(cls, one))
-        fault = "a subclass of BaseAlgorithm or of one of our base classes (docs/extending.md)"
-        raise UserError(f"{algo}: {entry.entry_point} must be {fault}; it lacks {missing}")
+    if cls is not None and (fault := fault_of(cls)):
+        raise UserError(f"{algo}: {entry.entry_point} {fault}", SMALLEST)
 
 
 def special_settings(entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -313,7 +310,7 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
     plain = {key: value for key, value in algorithm.items() if key not in asked}
     if str(special.get("n_timesteps")).startswith("auto"):
         asked.insert(0, str(special.pop("n_timesteps")))
-    code = digests_of(fields.get("gym_packages", ()))
+    code = digests_of(fields.get("gym_packages", ()), algo)
     found = {"algo": algo, "env_id": env_id, "algorithm": plain, "code": code}
     found |= {**special, **fields}
     spec = validated(found)

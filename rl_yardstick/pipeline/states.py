@@ -12,12 +12,9 @@ from __future__ import annotations
 
 import hmac
 import io
-import os
 import pickle
 import random
-import secrets
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +24,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
+from rl_yardstick.agents.common.model_files import key_of_user
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import read_bytes, replacing
 
@@ -73,7 +71,7 @@ def save_state(path: Path, roots: dict[str, Any], process: tuple[str, ...]) -> N
     _Pickler(stream, roots).dump((attributes, positions, generators))
     content = stream.getvalue()
     with replacing(path) as beside:
-        beside.write_bytes(hmac.digest(_key(), content, "sha256") + content)
+        beside.write_bytes(hmac.digest(key_of_user(), content, "sha256") + content)
 
 
 def load_state(path: Path, roots: dict[str, Any]) -> None:
@@ -82,7 +80,7 @@ def load_state(path: Path, roots: dict[str, Any]) -> None:
     Raises UserError if the state is not signed by this user.
     """
     content = read_bytes(path, MAX_STATE)
-    if not hmac.compare_digest(content[:32], hmac.digest(_key(), content[32:], "sha256")):
+    if not hmac.compare_digest(content[:32], hmac.digest(key_of_user(), content[32:], "sha256")):
         raise UserError(f"{path} is not signed with your key: a state of others is not loaded")
     unpickler: Any = pickle.Unpickler(io.BytesIO(content[32:]))  # noqa: S301  # signed
     unpickler.persistent_load = roots.__getitem__
@@ -97,21 +95,6 @@ def load_state(path: Path, roots: dict[str, Any]) -> None:
     random.setstate(python)
     np.random.set_state(numpy)  # noqa: NPY002
     th.set_rng_state(torch)
-
-
-def _key() -> bytes:
-    """This user's key, made on first use."""
-    folder = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "yardstick"
-    path = folder / "state.key"
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        beside = folder / f"state.key.{os.getpid()}"
-        beside.touch(mode=0o600)
-        beside.write_bytes(secrets.token_bytes(32))
-        with suppress(FileExistsError):
-            os.link(beside, path)  # the first of several processes wins
-        beside.unlink()
-    return read_bytes(path, 1000)
 
 
 def _left_out(kind: type) -> set[str]:

@@ -8,7 +8,8 @@ import pytest
 from rl_yardstick.diagnosis import agent_probes, target_probes
 from rl_yardstick.diagnosis.audit import Verdict, audit
 from rl_yardstick.diagnosis.faults import FAULTS, Finding
-from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject, register_class
+from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject
+from rl_yardstick.pipeline.components import agent_name, import_modules
 from tests.diagnosis import planted
 
 q_learning, sarsa = (partial(planted.one_step, target=target) for target in ("max", "next"))
@@ -28,8 +29,8 @@ def of_class(name):
     """A class to audit, with settings under which tiny worlds are learnt in few steps."""
     is_dqn = "dqn" in name.lower()
     if ":" in name:
-        register_class(name)
-    subject = ClassSubject(name, QUICK if is_dqn else {})
+        import_modules([name])
+    subject = ClassSubject(agent_name(name), QUICK if is_dqn else {})
     subject.steps = 100 if is_dqn else subject.steps
     return subject
 

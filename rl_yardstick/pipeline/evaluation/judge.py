@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from rl_yardstick.agents import policies
+from rl_yardstick.agents.plain import PlainAgent
 from rl_yardstick.agents.planning import RandomAgent
 from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Ints
@@ -56,7 +57,8 @@ class Judge:
                 # A user's agent that cannot be queried in all states may have memory.
                 scale, exact = exact.yardstick if obstacle else _scale_of_memory(exact), None
         world = None if exact is not None else world_of_memory(spec, agent)
-        if exact is None and policies.is_of_library(agent.predict.__module__):
+        is_plain = isinstance(agent, PlainAgent)  # and may remember
+        if exact is None and not is_plain and policies.is_of_library(agent.predict.__module__):
             n_envs = n_environments(spec.n_eval_envs, spec.eval_episodes)
         self.exact, self.env = exact, make_evaluation_env(spec, n_envs)
         self.evaluator: Any = exact

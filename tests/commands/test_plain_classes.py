@@ -1,0 +1,247 @@
+"""Agents that are plain classes of the user: trained, compared, played, explained, refused."""
+
+import json
+import signal
+import sys
+import zipfile
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+
+from rl_yardstick import agents
+from rl_yardstick.agents.own_classes import parameters_of
+from rl_yardstick.diagnosis import agent_probes, target_probes
+from rl_yardstick.diagnosis.audit import audit
+from rl_yardstick.experiments.pool import process_pool
+from rl_yardstick.pipeline.callbacks import StateCallback
+from rl_yardstick.pipeline.components import import_modules
+from rl_yardstick.pipeline.errors import Stopped, UserError
+from rl_yardstick.pipeline.models import load, load_agent, model_of_run
+from rl_yardstick.pipeline.run import Run, resumable
+from rl_yardstick.pipeline.training import train
+from tests.pipeline.short_runs import LAKE, run_of, spec_of
+
+MODULE = """
+import abc, random
+from collections import defaultdict
+import numpy as np, torch as th
+from stable_baselines3 import DQN
+class Base:
+    def learn(self, obs, action, reward, next_obs, terminated):
+        target = reward + self.gamma * max(self.q[next_obs]) * (not terminated)
+        self.q[obs][action] += self.step_size * (target - self.q[obs][action])
+    def values(self, obs):
+        return self.q[obs]
+class Table(Base):
+    def __init__(self, n_states, n_actions, seed, step_size=0.5, gamma=0.9, epsilon=1):
+        self.q, self.rng = np.zeros((n_states, n_actions)), np.random.default_rng(seed)
+        self.step_size, self.gamma, self.epsilon, self.episodes = step_size, gamma, epsilon, 0
+    def act(self, obs):
+        explores = self.rng.random() < self.epsilon
+        return self.rng.integers(len(self.q[obs])) if explores else int(self.q[obs].argmax())
+    def reset(self):
+        self.episodes += 1
+class Lazy(Base):  # no data: rows by a function, and Python's global generator
+    step_size, gamma = 0.5, 0.9
+    def __init__(self, env):
+        self.q, self.env, self.cut = defaultdict(lambda: [0.0] * env.action_space.n), env, 0
+    def act(self, obs, explore=True):
+        random.random()
+        return self.env.action_space.sample() if explore else int(np.argmax(self.q[obs]))
+    def learn(self, obs, action, reward, next_obs, terminated, truncated):
+        super().learn(obs, action, reward, next_obs, terminated)
+        self.cut += truncated
+class Net(Base):  # says itself what a zip holds
+    step_size, gamma = 0.5, 0.9
+    def __init__(self, n_states, n_actions):
+        self.q = th.zeros(n_states, n_actions)
+    def act(self, obs):
+        return int(self.q[obs].argmax()) if th.rand(()) < 0.1 else int(th.randint(4, ()))
+    def state_dict(self):
+        return {"q": self.q}
+    def load_state_dict(self, state):
+        self.q = state["q"]
+class Mine(DQN): ...
+class Asked:
+    def get_action(self, obs): ...
+class Short:
+    def act(self, obs): return 0
+    def learn(self, obs, action, reward): ...
+class Turned(Short):
+    def learn(self, obs, action, reward, terminated, next_obs): ...
+class Abstract(abc.ABC, Short):
+    @abc.abstractmethod
+    def act(self, obs): ...
+class Outside(Base):
+    def act(self, obs): return 7
+class Needs(Table):
+    def __init__(self, alpha): ...
+number = 3
+"""
+CELL = """
+class Cell:
+    def act(self, obs): return 1
+    def learn(self, obs, action, reward, next_obs, terminated): ...
+"""
+
+
+@pytest.fixture(autouse=True)
+def module(own_folder, monkeypatch):
+    """The user's module, and no pictures."""
+    (own_folder / "mine.py").write_text(MODULE)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr("rl_yardstick.pipeline.training.draw", lambda *_: None)
+
+
+def spec_for(cls, n_timesteps=400, **fields):
+    import_modules([typed := f"mine:{cls}"])
+    return spec_of(f"mine.{cls}", n_timesteps=n_timesteps, seed=3, gym_packages=[typed], **fields)
+
+
+def state_of(agent):
+    """What it has learnt, and where its generator is."""
+    rng, q = getattr(agent, "rng", None), [[*map(float, agent.q[obs])] for obs in range(16)]
+    return q, rng and rng.bit_generator.state, getattr(agent, "cut", 0)
+
+
+def test_it_does_what_a_loop_by_hand_does():
+    """Evaluations, which ask it too, change nothing."""
+    run, done = run_of(spec_for("Table", 600, eval_freq=50))
+    env, cls = gym.make(LAKE), sys.modules["mine"].Table
+    agent = cls(env.observation_space.n, env.action_space.n, seed=3)
+    (obs, _), rows, rewards = env.reset(seed=3), [], []
+    agent.reset()
+    for _ in range(600):
+        action = agent.act(obs)
+        next_obs, reward, terminated, truncated, _ = env.step(action)
+        rewards.append(reward)
+        agent.learn(obs, action, reward, next_obs, terminated)
+        obs = next_obs
+        if terminated or truncated:
+            rows.append([sum(rewards), len(rewards)])
+            agent.reset()
+            (obs, _), rewards = env.reset(), []
+    monitor = pd.read_csv(run.path / "0.monitor.csv", skiprows=1)
+    assert monitor[["r", "l"]].to_numpy().tolist() == rows
+    assert state_of(done.agent.agent) == state_of(agent)
+    assert agent.episodes == done.agent.agent.episodes
+    assert done.final.is_exact
+    loaded = load_agent(model_of_run(run))
+    assert state_of(loaded.agent) == state_of(agent)
+    greedy, _ = loaded.predict(np.arange(16), deterministic=True)
+    assert greedy.tolist() == agent.q.argmax(axis=1).tolist()
+
+
+@pytest.mark.parametrize(
+    ("cls", "form"), [("Table", "attributes"), ("Lazy", "pickle"), ("Net", "state_dict")]
+)
+def test_it_goes_on_bit_for_bit_and_its_zip_holds_its_state(cls, form, monkeypatch):
+    spec = spec_for(cls, 150)
+    _, whole = run_of(spec, "whole")
+    save = StateCallback._on_rollout_start
+
+    def until(self):
+        if self.model.num_timesteps == 60:
+            self.run.stop.number = signal.SIGTERM
+        save(self)
+
+    monkeypatch.setattr(StateCallback, "share_of_time", 1e9)
+    monkeypatch.setattr(StateCallback, "shortest_pause", 0.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(StateCallback, "_on_rollout_start", until)
+        with pytest.raises(Stopped):
+            run_of(spec, "parts")
+    run = Run(next(Path("parts").glob("*/*")))
+    with run:
+        again = train(resumable(run.path), run, resumes=True)
+    assert state_of(again.agent.agent) == state_of(whole.agent.agent)
+    path = run.model_path(spec)
+    assert form in json.loads(zipfile.ZipFile(path).read("data"))["state"]["pairs"][0]
+    assert state_of(load(spec, path, None).agent) == state_of(whole.agent.agent)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(run.path))  # as on the machine of another user
+    if form == "pickle":
+        with pytest.raises(UserError, match="holds a pickle, not signed with your key"):
+            load(spec, path, None)
+    else:
+        assert state_of(load(spec, path, None).agent) == state_of(whole.agent.agent)
+
+
+def test_it_is_judged_as_it_acts_unless_it_says_how_to_act_without_exploring():
+    found = {}
+    for cls in ("Table", "Lazy", "Net"):
+        _, done = run_of(spec_for(cls, 60))
+        found[cls] = done.final.is_exact
+    del sys.modules["mine"].Base.values
+    parameters_of.cache_clear()
+    _, done = run_of(spec_for("Table", 60))
+    assert (found, done.final.is_exact) == ({"Table": True, "Lazy": False, "Net": True}, False)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("mien:Table", "no module named mien: did you mean 'mine:Table'?"),
+        ("mine:Tabel", "mine:Tabel: there is no class 'Tabel': did you mean 'Table'?"),
+        ("mine:number", "mine.number is no class, but of type int"),
+        ("mine:Asked", "mine.Asked lacks act and learn; it has get_action"),
+        ("mine:Abstract", "mine.Abstract is abstract: it lacks act"),
+        ("./mine.py:Short", "has learn(obs, action, reward), which does not take (obs, action,"),
+        ("mine:Turned", "whose order must be (obs, action, reward, next_obs, terminated)"),
+        ("mine:Needs", "missing 1 required positional argument: 'alpha'"),
+        ("mine:Outside", "at step 0: Outside.act returned 7, not in Discrete(4)"),
+        ("mine.Table", "unknown agent 'mine.Table'"),
+    ],
+)
+def test_what_is_no_agent_is_refused(type_in_own_folder, own_folder, name, words):
+    code, _, err = type_in_own_folder("train.py", "--algo", name, "--env", LAKE, "-n", "20")
+    assert code == 2
+    assert words in err.splitlines()[0]
+    assert ("class MyAgent:\n    def act(self, obs):\n" in err) == (err.count("\n") > 1)
+    assert (own_folder / "logs").exists() == (name == "mine:Outside")  # it has begun
+
+
+def test_commands_take_it(type_in_own_folder, own_folder, in_this_process):
+    words = ["--env", LAKE, "-n", "300"]
+    algo = ["--algo", "mine:Table"]
+    first = [*words, *algo, "--seed", "0", "-params", "epsilon:0.5"]
+    code, out, err = type_in_own_folder("train.py", *first)
+    assert (code, err) == (0, "")
+    assert "--gym-packages mine:Table" in out
+    run = "logs/mine.Table/FrozenLake-v1_1"
+    assert "add --gym-packages mine:Table" in type_in_own_folder("enjoy.py", run)[2]
+    played = ["enjoy.py", run, "--n-episodes", "1", "--render", "none"]
+    for command in (played, ["yardstick", "explain", run]):
+        assert type_in_own_folder(*command, *algo)[::2] == (0, "")
+    zipped = ["-i", f"{run}/FrozenLake-v1.zip", "--seed", "1"]
+    assert type_in_own_folder("train.py", *words, *algo, *zipped)[::2] == (0, "")
+    words += ["--algos", "random", "mine:Table", "mine:Mine", "--seeds", "2", "--no-report"]
+    code, out, err = type_in_own_folder("compare.py", *words)
+    assert (code, err) == (0, "")
+    assert "mine.Table                 undecided" in out
+
+
+def test_audit_takes_it(type_in_own_folder, monkeypatch):
+    probes = (agent_probes.probe_choice, target_probes.probe_ends, target_probes.probe_discount)
+    monkeypatch.setattr(audit, "__defaults__", (probes,))
+    words = ("--algo", "mine:Table", "--kind", "q_learning", "--observations", "discrete")
+    code, out, err = type_in_own_folder("yardstick", "audit", *words)
+    assert (code, err) == (0, ""), out
+
+
+def action_of(name):
+    return agents.load_algorithm(name).plain().act(0)
+
+
+def test_other_processes_get_classes_by_value(own_folder):
+    cell = {"__name__": "__main__"}
+    exec(CELL, cell)  # noqa: S102  # as a notebook does
+    assert agents.name_of(cell["Cell"]) == "Cell"
+    with pytest.raises(ValueError, match="there is an agent ppo already"):
+        agents.name_of(type("PPO", (cell["Cell"],), {"__module__": "__main__"}))
+    pool = process_pool(1)
+    assert pool.schedule(action_of, args=["Cell"]).result() == 1
+    pool.stop()
+    pool.join()
