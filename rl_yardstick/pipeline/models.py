@@ -215,13 +215,19 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
     replaced: dict[str, Any] = {
         "learning_rate": 0.0,
         **dict.fromkeys(("lr_schedule", "clip_range", "clip_range_vf"), unused),
+        "delta_std_schedule": unused,
         "action_noise": None,
         "n_steps": 1,
+        "replay_buffer_class": None,  # for hindsight, it needs the environment's reward
+        "replay_buffer_kwargs": {},
     }
     if env is not None:
         saved, here = zip_data(model.path).get("observation_space"), vars(env.observation_space)
         found, needed = (
-            str(one.get("n", tuple(one.get("_shape") or ()))) if isinstance(one, dict) else ""
+            # Before version 0.20, Gym had it as ``shape``.
+            str(one.get("n", tuple(one.get("_shape", one.get("shape")) or ())))
+            if isinstance(one, dict)
+            else ""
             for one in (saved, here)
         )
         if found not in ("", needed):
@@ -252,6 +258,7 @@ def load(spec: TrainSpec, path: Path, env: VecEnv | None, **replaced: Any) -> Ba
         with warnings.catch_warnings():
             # About a buffer that the library itself has chosen.
             warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
+            warnings.filterwarnings("ignore", "You are probably loading a")  # older model
             classes = _own_classes(algorithm, spec.gym_packages)
             return load_model(algorithm, content, env, classes=classes, **replaced)  # type: ignore[no-any-return]
     except UserError:
