@@ -229,6 +229,12 @@ _SHARED: Sequence[Flag] = (
         "tables interpreted; the default of all others is auto",
         choices=("auto", "compiled", "library", "interpreted"),
     ),
+    flag(
+        "--vec-normalize",
+        "VecNormalize's statistics of the model, or none (default: those of its run)",
+        Path,
+        metavar="FILE",
+    ),
     flag("--device", "torch device (default: auto)", default="auto"),
     flag("--num-threads", "torch threads (1); -1 leaves it to torch", THREADS, 1),
     flag("-n --n-timesteps", "environment steps of each run", COUNT),

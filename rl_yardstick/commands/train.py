@@ -58,6 +58,7 @@ FLAGS: Flags = {
         several("--eval-env-kwargs", "environment arguments for evaluation only"),
         *shared("--gym-packages"),
         flag("-i --trained-agent", "zip or run folder to train further", default="", metavar="ZIP"),
+        *shared("--vec-normalize"),
         flag("--vec-env", "kind of VecEnv", default="dummy", choices=["dummy", "subproc"]),
         *shared("--device", "--num-threads"),
     ),
@@ -169,6 +170,7 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
         final_episodes=args.eval_episodes,
         n_threads=args.num_threads,
         trained_agent=whole_zip(Path(args.trained_agent)) if args.trained_agent else None,
+        vec_normalize=_statistics(args),
         tensorboard_log=args.tensorboard_log or None,
         library_log=args.verbose > 1,
         watch_learning=_page(args),
@@ -219,6 +221,14 @@ def whole_zip(path: Path) -> str:
     path = model_in(path) if path.is_dir() else path
     zip_data(path)
     return str(path.absolute())
+
+
+def _statistics(args: argparse.Namespace) -> str | None:
+    """The absolute path of ``--vec-normalize``, or ``none``."""
+    path = args.vec_normalize
+    if path is not None and not args.trained_agent:
+        raise UserError("--vec-normalize needs --trained-agent")
+    return None if path is None else str(path if str(path) == "none" else path.absolute())
 
 
 def _page(args: argparse.Namespace) -> str | None:

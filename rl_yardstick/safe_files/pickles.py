@@ -15,10 +15,10 @@ from typing import Any, ClassVar
 
 from rl_yardstick.safe_files.files import Budget, UnsafeFileError, shown
 
-# The instructions of protocols 0 to 5, without sets, extension codes, out-of-band buffers, Python
-# 2's texts, and what imports or calls in one go.
+# The instructions of protocols 0 to 5, without frozen sets, extension codes, out-of-band buffers,
+# Python 2's texts, and keyword arguments.
 _NAMES = (
-    "INT LONG FLOAT UNICODE LIST DICT PUT GET "
+    "INT LONG FLOAT UNICODE LIST DICT PUT GET EMPTY_SET ADDITEMS "
     "PROTO FRAME STOP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 LONG4 BINFLOAT "
     "SHORT_BINUNICODE BINUNICODE BINUNICODE8 SHORT_BINBYTES BINBYTES BINBYTES8 BYTEARRAY8 "
     "EMPTY_LIST EMPTY_TUPLE EMPTY_DICT TUPLE TUPLE1 TUPLE2 TUPLE3 MARK POP POP_MARK APPEND APPENDS "
@@ -57,6 +57,8 @@ class Made:
 
     def append(self, item: Any) -> None:
         self.items.append(item)
+
+    add = append  # which sets have
 
     def __setitem__(self, key: Any, value: Any) -> None:
         self.items += (key, value)
@@ -115,6 +117,9 @@ class Reader(pickle._Unpickler):
     def load_dictionary(self) -> None:
         self.append(Made(DICTIONARY, ()))  # hashing the keys could take for ever
 
+    def load_set(self) -> None:
+        self.append(Made("set", ()))  # no file needs one, but `VecNormalize` may have one inside
+
     def load_filled_dictionary(self) -> None:
         items = self.pop_mark()
         self.append(Made(DICTIONARY, (), items=items))
@@ -134,6 +139,7 @@ class Reader(pickle._Unpickler):
         top.state = state
 
     dispatch[pickle.EMPTY_DICT[0]] = load_dictionary
+    dispatch[pickle.EMPTY_SET[0]] = load_set
     dispatch[pickle.DICT[0]] = load_filled_dictionary
     dispatch[pickle.REDUCE[0]] = dispatch[pickle.NEWOBJ[0]] = load_call
     dispatch[pickle.BUILD[0]] = load_state
