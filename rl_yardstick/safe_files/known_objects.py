@@ -143,7 +143,7 @@ def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
             return storages[key]
 
         return Build({**_OF_TENSORS, pickles.PERSISTENT_ID: storage}, {}, budget)(tree)
-    except UnsafeFileError as error:
+    except Exception as error:  # a damaged file can fail anywhere
         raise UnsafeFileError(f"holds tensors that cannot be read: {error}") from error
 
 
@@ -157,8 +157,11 @@ def _records(content: bytes, budget: Budget) -> tuple[Any, dict[str, bytes]]:
         kinds = {str(key): kind for _, kind, key, *_ in reader.persistent_ids if type(key) is str}
         members = {}
         for key in map(str, keys):
-            n_bytes = min(int.from_bytes(file.read(8), "little"), len(content))
-            members[f"data/{key}"] = file.read(n_bytes * _DTYPES[kinds[key].name].itemsize)
+            size, width = int.from_bytes(file.read(8), "little"), _DTYPES[kinds[key].name].itemsize
+            record = file.read(min(size, len(content)) * width)
+            if len(record) != size * width:
+                raise UnsafeFileError("a storage that is cut off")
+            members[f"data/{key}"] = record
         return tree, members
     # The name of a member begins with that of a folder.
     records = read_members(content, budget).items()
@@ -257,6 +260,7 @@ _MAKERS: Mapping[str, Maker] = {
         0.0, fields(made, build)["initial_value"]
     ),
     # How protocols 0 to 2 hold bytes.
+    "builtins.bytes": lambda made, build: b"".join(made.args),  # of none
     "_codecs.encode": lambda made, build: build(made.args)[0].encode("latin1"),
     "torch.device": lambda made, build: th.device("cpu"),  # the caller chooses
 }

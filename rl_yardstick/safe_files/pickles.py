@@ -33,7 +33,7 @@ MAX_DEPTH, MAX_INTEGER_BITS = 40, 128
 _END_OF_KEYS = (1 << 61) - 1  # larger integers are not their own hash: any number can share one
 # Packages that were renamed: NumPy's inner one, and Gym, whose spaces Gymnasium took over.
 _RENAMED = {"numpy.core.": "numpy._core.", "gym.spaces.": "gymnasium.spaces."}
-_RENAMED |= {"copy_reg.": "copyreg."}
+_RENAMED |= {"copy_reg.": "copyreg.", "__builtin__.": "builtins."}  # in protocols 0 to 2
 # The names of records of dictionaries and of persistent ids. Names in a file have a dot.
 DICTIONARY, PERSISTENT_ID = "dict", "persistent id"
 _NEW_OBJECT = "copyreg._reconstructor"  # how protocols 0 and 1 make an object
@@ -122,6 +122,8 @@ class Reader(pickle._Unpickler):
 
     def load_filled_dictionary(self) -> None:
         items = self.pop_mark()
+        if len(items) % 2:
+            raise UnsafeFileError("a dictionary with a key that has no value")
         self.append(Made(DICTIONARY, (), items=items))
 
     def load_call(self) -> None:
