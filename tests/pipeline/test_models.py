@@ -121,54 +121,43 @@ def test_statistics_go_on_unless_the_new_entry_has_none(normalised, tmp_path):
     assert seen(run.path / CART / "vecnormalize.pkl") == 42
 
 
-@pytest.mark.parametrize(
-    "name", ["vecnormalize.pkl", "vec_normalize.pkl", f"{CART}/vecnormalize.pkl"]
-)
+@pytest.mark.parametrize("name", ["vec_normalize.pkl", f"{CART}/vecnormalize.pkl"])
 def test_statistics_beside_a_lone_zip_are_its_own(normalised, tmp_path, name):
-    saved, path = tmp_path / "lone" / name, tmp_path / "lone" / f"{CART}.zip"
-    saved.parent.mkdir(parents=True)
-    path.write_bytes((normalised.path / path.name).read_bytes())
-    request = {"path": path, "algo": "a2c", "env_id": CART}
-    assert find_model(Wanted(**request)).spec.normalize is None
-    content = (normalised.path / CART / "vecnormalize.pkl").read_bytes()
-    saved.write_bytes(content)
-    found = find_model(Wanted(**request))
+    saved, lone = tmp_path / name, {"path": tmp_path / f"{CART}.zip", "algo": "a2c", "env_id": CART}
+    lone["path"].write_bytes((normalised.path / f"{CART}.zip").read_bytes())
+    for place in (saved, other := tmp_path / "another" / "vecnormalize.pkl"):
+        place.parent.mkdir(exist_ok=True)
+        place.write_bytes((normalised.path / CART / "vecnormalize.pkl").read_bytes())
+    assert other.exists()
+    found = find_model(Wanted(**lone))
     assert (found.statistics, found.spec.normalize["clip_obs"]) == (saved, 3.0)
-    found = find_model(Wanted(**request, statistics=Path("none")))
-    assert (found.statistics, found.spec.normalize) == (None, None)
     saved.unlink()
-    (other := tmp_path / "lone" / "another" / "vecnormalize.pkl").parent.mkdir()
-    other.write_bytes(content)  # of another model
-    assert find_model(Wanted(**request)).statistics is None
+    for wanted in (Wanted(**lone), Wanted(normalised.path, statistics=Path("none"))):
+        found = find_model(wanted)
+        assert (found.statistics, found.spec.normalize) == (None, None)
 
 
 def test_statistics_of_other_observations_are_refused_with_a_way_out(normalised, tmp_path):
-    VecNormalize(make_vec_env("Pendulum-v1")).save(str(tmp_path / "other.pkl"))
-    named = Wanted(normalised.path, statistics=tmp_path / "other.pkl")
-    with pytest.raises(UserError, match=r"\(3,\); the environment gives \(4,\): --vec-normalize"):
-        returns_of(named, 1)
-    keyed = VecNormalize(make_vec_env(SimpleMultiObsEnv), norm_obs_keys=["vec"])
-    keyed.save(str(tmp_path / "other.pkl"))
-    with pytest.raises(UserError, match=r"normalize: `norm_obs_keys` .* the environment gives Box"):
-        returns_of(named, 1)
+    path = tmp_path / "other.pkl"
+    for other, keys, said in (
+        ("Pendulum-v1", None, r"\(3,\); the environment gives \(4,\): --vec-normalize"),
+        (SimpleMultiObsEnv, ["vec"], r"normalize: `norm_obs_keys` .* the environment gives Box"),
+    ):
+        VecNormalize(make_vec_env(other), norm_obs_keys=keys).save(str(path))
+        with pytest.raises(UserError, match=said):
+            returns_of(Wanted(normalised.path, statistics=path), 1)
 
 
 def test_a_training_begins_with_the_statistics_that_it_names(normalised, tmp_path):
     begun = {"trained_agent": str(normalised.path / "rl_model_60_steps.zip"), "eval_freq": -1}
-    for given, name, n_seen in (
-        (None, "rl_model_vecnormalize_60_steps.pkl", 62),
-        (str(normalised.path / CART / "vecnormalize.pkl"), "vecnormalize.pkl", 202),
-    ):
-        console = Console(file=io.StringIO(), width=300)
-        fields = {**BRIEFLY, **begun, "vec_normalize": given}
-        spec = spec_of("a2c", CART, SMALL_A2C, n_timesteps=40, **fields)
-        run, _ = run_of(spec, tmp_path, console=console)
-        told = console.file.getvalue()
-        assert f"note: normalised by the statistics in {normalised.path}/" in told
-        assert Path(run.spec().vec_normalize).name == name
-        assert seen(run.path / CART / "vecnormalize.pkl") == n_seen + 42
-    begun |= {"vec_normalize": "none"}
-    assert train_to(tmp_path, "a2c", SMALL_A2C, 40, **begun).spec().normalize is None
+    last, console = normalised.path / CART / "vecnormalize.pkl", Console(file=io.StringIO())
+    console.width = 300
+    spec = spec_of("a2c", CART, SMALL_A2C, n_timesteps=40, vec_normalize=str(last), **begun)
+    run, _ = run_of(spec, tmp_path, console=console)
+    assert f"note: normalised by the statistics in {last}\n" in console.file.getvalue()
+    assert seen(run.path / CART / "vecnormalize.pkl") == 202 + 42
+    run = train_to(tmp_path, "a2c", SMALL_A2C, 40, vec_normalize="none", **begun)
+    assert run.spec().normalize is None
 
 
 def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tmp_path):

@@ -91,13 +91,11 @@ ATTACKS = {
 ATTACKS = {attack: START + instructions + b"." for attack, instructions in ATTACKS.items()} | {
     "a call of the system in protocol 0": b"cos\nsystem\n(S'true'\ntR.",
     "a call of the system in protocol 2": b"\x80\x02cos\nsystem\nX\4\0\0\0true\x85R.",
-    "an object of a system's class in protocol 0": b"ccopy_reg\n_reconstructor\n(cos\n_wrap_close\nc__builtin__\nobject\nNtR.",
+    "an object of the system in protocol 0": b"ccopy_reg\n_reconstructor\n(cos\nDirEntry\nNNtR.",
     "an object of no class": b"ccopy_reg\n_reconstructor\n(K\1c__builtin__\nobject\nNtR.",
     "a key in protocol 0 whose hash takes for ever": START + LAYERS + b"(" + TOP + b"Nd.",
     "an unpaired key in protocol 0": b"(V\nd.",
-    "a number of thousands of digits in protocol 0": b"I" + b"9" * 4000 + b"\n.",
     "a place of thousands of digits": b"Np" + b"9" * 4000 + b"\n.",
-    "a place of the memo that is empty, by protocol 0": b"g7\n.",
     "lists in lists in protocol 0": b"(" * 500 + b"l" * 500 + b".",
     "bytes of a number": b"c_codecs\nencode\n(K\1V\ntR.",
     "bytes of many": b"c__builtin__\nbytes\n(J\xff\xff\xff\x7ftR.",
@@ -150,18 +148,7 @@ def test_attacks_by_pickle_are_refused(attack, loaders):
 
 def test_no_other_instruction_makes_or_fetches_anything():
     others = {op.name for op in pickletools.opcodes} - INSTRUCTIONS
-    assert others >= {
-        "INST",
-        "OBJ",
-        "STRING",
-        "FROZENSET",
-        "NEWOBJ_EX",
-        "EXT1",
-        "EXT2",
-        "EXT4",
-        "PERSID",
-        "NEXT_BUFFER",
-    }
+    assert others >= {"INST", "OBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID", "NEXT_BUFFER"}
 
 
 def members_of(agent):
@@ -369,7 +356,6 @@ BOMBS = {
     "a wide text of protocol 0": b"V" + b"a" * 16 * MB + b"\\U0001f600\n.",
     "many sets": b"](" + b"\x8f" * 4_000_000 + b"e.",
     "many dictionaries of protocol 0": b"](" + b"(d" * 2_000_000 + b"e.",
-    "many lists of protocol 0": b"](" + b"(l" * 2_000_000 + b"e.",
     "a value that is huge once it is written out": LAYERS + TOP + b".",
     # What reading them takes just fits the budget.
     "dictionaries that just fit": b"](" + b"}K\x01Ns" * 90_000 + b"e.",
@@ -414,33 +400,26 @@ def test_storages_that_pytorch_does_not_write_are_refused():
         assert check_peak(attack, content, lambda stream: load_tensors(stream.read())), attack
 
 
-def stream(tensors):
+def stream(content):
     """A file as PyTorch wrote it before version 1.6: five pickles, then sizes and numbers."""
-    th.save(tensors, file := io.BytesIO(), _use_new_zipfile_serialization=False)
+    th.save(content, file := io.BytesIO(), _use_new_zipfile_serialization=False)
     return file.getvalue()
 
 
 def test_streams_of_tensors_are_read_or_refused():
     shared = th.arange(6.0)
     held = {"a": shared[::2], "b": [shared.view(2, 3)], "c": th.ones(2, dtype=th.uint8), "d": {}}
-    found = load_tensors(whole := stream(held))
-    assert str(found) == str(held)
-    ones = stream({"x": th.ones(5)})
-    one, numbers = ones[:-28], ones[-20:]
-    assert ones[-28:] == struct.pack("<Q5f", 5, *[1.0] * 5)
-    key = one.rindex(b"]") + 2  # of the list of keys
-    attacks = {
-        "many numbers": one + struct.pack("<Q", 10**18) + numbers,
-        "more than can be counted": one + b"\xff" * 8 + numbers,
-        "no numbers": one,
-        "fewer numbers": ones[:-1],
-        "no list of keys": one[: key - 2] + b"N.",
-        "another key": whole[:-40] + whole[-20:],
-        "a call": stream({})[:15] + pickle.dumps(Attack("mark")),
-        "a magic number": whole[:15],
-    }
-    for attack, content in attacks.items():
-        assert check_peak(attack, content, lambda file: load_tensors(file.read())), attack
+    assert str(load_tensors(stream(held))) == str(held)
+    whole = stream({"x": th.ones(5)})
+    start, numbers = whole[:-28], whole[-20:]  # and eight bytes of their size
+    for content in (
+        *(start + size.to_bytes(8, "little") + numbers for size in (0, 4, 6, 10**18, 2**64 - 1)),
+        *(whole[:-1], start, whole[:15], stream({})[:15] + pickle.dumps(Attack("mark"))),
+        start[: start.rindex(b"]")] + b"N.",
+        start.replace(b"]q\0", b"]q\0}a") + whole[-28:],
+        whole.replace(b"FloatStorage", b"EvilyStorage"),
+    ):
+        assert check_peak("a stream", content, lambda file: load_tensors(file.read()))
 
 
 def hostile_zips(genuine):

@@ -1,7 +1,4 @@
-"""Models, buffers and statistics that old versions of the library really saved.
-
-`old_models/make.py` made them. Beside each lie observations, and the actions of that version.
-"""
+"""What old versions of the library really saved: `old_models/make.py` made the files."""
 
 import io
 import pickle
@@ -19,48 +16,25 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
 from rl_yardstick.pipeline.models import Model, load_agent
-from rl_yardstick.safe_files.buffers_and_statistics import (
-    load_replay_buffer,
-    load_vec_normalize,
-    read_normalization,
-)
+from rl_yardstick.safe_files import buffers_and_statistics as loaders
 from rl_yardstick.safe_files.files import UnsafeFileError
 from rl_yardstick.safe_files.models import load_model
 from tests.pipeline.short_runs import CART, SWING, spec_of
 
 FOLDER = Path(__file__).parent / "old_models"
-ALGOS = {path.stem: path.stem.rsplit("_", 1)[0] for path in FOLDER.glob("*.npz")}
-ALGOS |= {"a2c_shared_1.6.2": "a2c", "dqn_hindsight_1.6.2": "dqn", "td3_noise_1.6.2": "td3"}
+MODELS = sorted(path.stem for path in FOLDER.glob("*.npz"))
 
 
-def played(name, path=None):
-    return load_agent(Model(path or FOLDER / f"{name}.zip", spec_of(ALGOS[name]), None, None))
-
-
-def as_streams(path, target):
-    """The zip as PyTorch would have written it before version 1.6."""
-    with zipfile.ZipFile(path) as whole, zipfile.ZipFile(target, "w") as old:
-        for member in whole.namelist():
-            content = whole.read(member)
-            if member.endswith(".pth"):
-                held = th.load(io.BytesIO(content))
-                file = io.BytesIO()
-                th.save(held, file, _use_new_zipfile_serialization=False)
-                content = file.getvalue()
-            old.writestr(member, content)
-    return target
-
-
-@pytest.mark.parametrize("name", sorted(ALGOS))
-def test_an_old_model_plays_as_it_did(name, tmp_path):
-    with np.load(FOLDER / f"{name}.npz") as saved:
-        actions, seen = saved["actions"], {key: saved[key] for key in saved if key != "actions"}
+@pytest.mark.parametrize("name", MODELS)
+def test_an_old_model_plays_as_it_did(name):
+    algo = "ppo_lstm" if "lstm" in name else name.split("_")[0]
+    agent = load_agent(Model(FOLDER / f"{name}.zip", spec_of(algo), None, None))
+    with np.load(FOLDER / f"{name}.npz") as saved:  # each observation, and that version's action
+        seen = dict(saved)
+    actions = seen.pop("actions")
     rows = [{key: array[i] for key, array in seen.items()} for i in range(len(actions))]
-    for path in (None, as_streams(FOLDER / f"{name}.zip", tmp_path / "stream.zip")):
-        agent = played(name, path)
-        found = np.array([agent.predict(row.get("", row), deterministic=True)[0] for row in rows])
-        assert found.dtype == actions.dtype
-        np.testing.assert_array_equal(found, actions)
+    found = [agent.predict(row.get("", row), deterministic=True)[0] for row in rows]
+    np.testing.assert_array_equal(np.array(found), actions, strict=True)
 
 
 def test_layers_that_actor_and_critic_share_are_played_but_not_trained():
@@ -69,61 +43,44 @@ def test_layers_that_actor_and_critic_share_are_played_but_not_trained():
         load_model(sb3.A2C, path)
     with zipfile.ZipFile(path) as file:
         was = th.load(io.BytesIO(file.read("policy.pth")))
-    policy = load_model(sb3.A2C, path, learning_rate=0.0, device="cpu").policy
-    obs = th.as_tensor(np.load(path.with_suffix(".npz"))[""])
-    shared = obs
+    obs = values = th.as_tensor(np.load(path.with_suffix(".npz"))[""])
     for layer in ("shared_net.0", "shared_net.2", "value_net.0"):
         weight, bias = (was[f"mlp_extractor.{layer}.{kind}"] for kind in ("weight", "bias"))
-        shared = th.relu(shared @ weight.T + bias)
-    values = shared @ was["value_net.weight"].T + was["value_net.bias"]
+        values = th.relu(values @ weight.T + bias)
+    values = values @ was["value_net.weight"].T + was["value_net.bias"]
+    policy = load_model(sb3.A2C, path, learning_rate=0.0, device="cpu").policy
     assert th.allclose(policy.predict_values(obs), values, atol=1e-6)
 
 
-def test_old_noise_goes_on_training():
-    env = gym.make(SWING)
-    agent = load_model(sb3.TD3, FOLDER / "td3_noise_1.6.2.zip", env, device="cpu")
-    assert agent.action_noise is not None
-    before = agent.num_timesteps
-    agent.learn(20, reset_num_timesteps=False)
-    assert agent.num_timesteps == before + 200  # it learns after whole episodes
-
-
 @pytest.mark.filterwarnings("ignore:You are probably loading a DQN model saved with:UserWarning")
-def test_an_old_replay_buffer_is_read_or_refused_in_one_line():
-    path, given = FOLDER / "qrdqn_1.8.0.zip", {"device": "cpu", "learning_rate": 1e-3}
-    agent = load_model(contrib.QRDQN, path, exploration_schedule=None, **given)
-    load_replay_buffer(agent, path.with_suffix(".pkl"))
-    buffer = agent.replay_buffer
-    assert (buffer.pos, buffer.observations.shape) == (40, (60, 1, 4))
-    assert np.all(buffer.observations[:40].any(axis=-1))
-    path = FOLDER / "dqn_hindsight_1.6.2.zip"
-    agent = load_model(sb3.DQN, path, BitFlippingEnv(3, max_steps=3), **given)
-    with pytest.raises(UnsafeFileError, match=r"HerReplayBuffer of an older version, without"):
-        load_replay_buffer(agent, path.with_suffix(".pkl"))
-
-
-def test_old_statistics_are_read():
-    path, env = FOLDER / "vecnormalize_1.6.2.pkl", make_vec_env(SWING)
-    found = load_vec_normalize(path, env)
-    assert (found.obs_rms.count, found.clip_obs) == (pytest.approx(1.0001), 10.0)
-    with pytest.raises(UnsafeFileError, match="holds statistics of Box"):
-        load_vec_normalize(path, make_vec_env(CART))
+def test_old_models_are_trained_further_and_old_buffers_are_read_or_refused():
+    path, env = FOLDER / "td3_noise_1.6.2.zip", gym.make(SWING)  # its noise goes on
+    assert load_model(sb3.TD3, path, env, device="cpu").learn(9).num_timesteps == 200
+    path = FOLDER / "qrdqn_1.8.0.zip"
+    agent = load_model(contrib.QRDQN, path, device="cpu")
+    loaders.load_replay_buffer(agent, path.with_suffix(".pkl"))
+    assert agent.replay_buffer.pos == 40
+    assert np.all(agent.replay_buffer.observations.any(axis=-1)[:, 0] == (np.arange(60) < 40))
+    path, env = FOLDER / "dqn_hindsight_1.6.2.zip", BitFlippingEnv(3, max_steps=3)
+    agent = load_model(sb3.DQN, path, env, device="cpu")
+    with pytest.raises(UnsafeFileError, match=r"a HerReplayBuffer of an older version, without"):
+        loaders.load_replay_buffer(agent, path.with_suffix(".pkl"))
 
 
 @pytest.mark.parametrize("protocol", range(6))
 def test_every_protocol_of_pickle_is_read(protocol):
+    with (FOLDER / "vecnormalize_1.6.2.pkl").open("rb") as file:
+        assert loaders.read_normalization(file.read()).observation_space.shape == (3,)
     env = make_vec_env(CART)
     env.observation_space.seed(0)
-    env.venv_holds = {"a set": {1}}  # in what is not read
+    env.extra = {"a set": {1}}  # in what is not read
     made = VecNormalize(env, clip_obs=3.0)
     made.reset()
-    found = read_normalization(pickle.dumps(made, protocol))
-    assert found.settings["clip_obs"] == 3.0
-    assert found.observation_space == env.observation_space
+    found = loaders.read_normalization(pickle.dumps(made, protocol))
+    assert (found.settings["clip_obs"], found.observation_space) == (3.0, env.observation_space)
     np.testing.assert_array_equal(found.obs_rms.var, made.obs_rms.var)
     agent = sb3.DQN("MlpPolicy", CART, buffer_size=30, learning_starts=30, device="cpu").learn(9)
     buffer = agent.replay_buffer
-    load_replay_buffer(agent, io.BytesIO(pickle.dumps(buffer, protocol)))
-    assert agent.replay_buffer is not buffer
+    loaders.load_replay_buffer(agent, io.BytesIO(pickle.dumps(buffer, protocol)))
     for name in ("observations", "actions", "rewards", "timeouts"):
         np.testing.assert_array_equal(getattr(agent.replay_buffer, name), getattr(buffer, name))

@@ -1,12 +1,8 @@
-"""Makes the models of this folder that have actions beside them, and what lies with these.
+"""Makes the models of this folder that have observations and actions beside them.
 
-Run it as ``python make.py FOLDER`` with Python 3.11 and one of these, each with its NumPy:
-stable-baselines3 and sb3-contrib 1.6.2 (gym 0.21, NumPy 1.23.5), 1.8.0 (gym 0.21, 1.24.4), 2.1.0
-(1.25.2) and 2.6.0 (1.26.4). Beside each zip it writes the library's own actions.
+Run ``python make.py`` in this folder, with Python 3.11 and stable-baselines3 and sb3-contrib of
+1.6.2 (gym 0.21, NumPy 1.23.5), 1.8.0 (gym 0.21, 1.24.4), 2.1.0 (1.25.2) or 2.6.0 (1.26.4).
 """
-
-import sys
-from pathlib import Path
 
 import numpy as np
 import sb3_contrib as contrib
@@ -17,59 +13,41 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-FOLDER, VERSION = Path(sys.argv[1]), sb3.__version__
 CART, SWING, BITS = "CartPole-v1", "Pendulum-v1", BitFlippingEnv(3, max_steps=3)
-ALIKE = {"seed": 0, "device": "cpu"}
-FEW = {
-    "learning_starts": 10,
-    "buffer_size": 60,
-    "batch_size": 8,
-    "policy_kwargs": {"net_arch": [4]},
-}
-HINDSIGHT = {
-    "learning_rate": 0.1,
-    "replay_buffer_class": sb3.HerReplayBuffer,
-    "replay_buffer_kwargs": {"n_sampled_goal": 2, "online_sampling": True, "max_episode_length": 3},
-}
+LAYERS, FEW = {"net_arch": [4]}, {"learning_starts": 10, "buffer_size": 60, "batch_size": 8}
+HINDSIGHT = {"replay_buffer_class": sb3.HerReplayBuffer, "learning_rate": 0.1, **FEW}
+GOALS = {"n_sampled_goal": 2, "online_sampling": True, "max_episode_length": 3}
 SHARED = {"net_arch": [4, 3, {"pi": [4], "vf": [2]}], "activation_fn": nn.ReLU}
 NOISE = NormalActionNoise(np.zeros(1), np.full(1, 0.1))
-QUANTILES = {"policy_kwargs": {"net_arch": [4], "n_quantiles": 5}}
-LSTM = {"batch_size": 16, "policy_kwargs": {"net_arch": [4], "lstm_hidden_size": 4}}
+# The class, the policy, the environment, the policy's arguments and the others.
 MODELS = {
-    "1.6.2": {
-        "a2c_shared": (sb3.A2C, "Mlp", SWING, {"n_steps": 16, "policy_kwargs": SHARED}),
-        "ars": (contrib.ARS, "Linear", CART, {"n_delta": 2}),
-        "dqn_hindsight": (sb3.DQN, "MultiInput", BITS, {**FEW, **HINDSIGHT}),
-        "td3_noise": (sb3.TD3, "Mlp", SWING, {**FEW, "action_noise": NOISE}),
-    },
-    "1.8.0": {"qrdqn": (contrib.QRDQN, "Mlp", CART, {**FEW, **QUANTILES})},
-    "2.1.0": {"ppo_lstm": (contrib.RecurrentPPO, "MlpLstm", CART, {"n_steps": 16, **LSTM})},
-    "2.6.0": {
-        "trpo": (contrib.TRPO, "Mlp", SWING, {"n_steps": 16, "policy_kwargs": {"net_arch": [4]}})
-    },
-}
+    "a2c_shared_1.6.2": (sb3.A2C, "Mlp", SWING, SHARED, {"n_steps": 16}),
+    "ars_1.6.2": (contrib.ARS, "Linear", CART, {}, {"n_delta": 2}),
+    "dqn_hindsight_1.6.2":
+        (sb3.DQN, "MultiInput", BITS, LAYERS, {**HINDSIGHT, "replay_buffer_kwargs": GOALS}),
+    "td3_noise_1.6.2": (sb3.TD3, "Mlp", SWING, LAYERS, {**FEW, "action_noise": NOISE}),
+    "qrdqn_1.8.0": (contrib.QRDQN, "Mlp", CART, {**LAYERS, "n_quantiles": 5}, FEW),
+    "ppo_lstm_2.1.0": (contrib.RecurrentPPO, "MlpLstm", CART, {**LAYERS, "lstm_hidden_size": 4},
+                       {"n_steps": 16, "batch_size": 16}),
+    "trpo_2.6.0": (contrib.TRPO, "Mlp", SWING, LAYERS, {"n_steps": 16}),
+}  # fmt: skip
 random = np.random.RandomState(0)
-OBSERVATIONS = {
+SEEN = {
     CART: {"": random.uniform(-3, 3, (20, 4)).astype(np.float32)},
     SWING: {"": random.uniform(-1, 1, (20, 3)).astype(np.float32)},
-    BITS: {
-        key: (random.rand(20, 3) < 0.5).astype(np.int8)
-        for key in ("observation", "achieved_goal", "desired_goal")
-    },
+    BITS: {key: random.randint(0, 2, (20, 3)).astype(np.int8) for key in BITS.observation_space},
 }
-
-for name, (algorithm, policy, env, kwargs) in MODELS[VERSION].items():
-    model = algorithm(f"{policy}Policy", env, **kwargs, **ALIKE).learn(40)
-    model.save(FOLDER / f"{name}_{VERSION}.zip")
-    seen = OBSERVATIONS[env]
-    rows = [{key: array[i] for key, array in seen.items()} for i in range(20)]
-    actions = [model.predict(row.get("", row), deterministic=True)[0] for row in rows]
-    np.savez(FOLDER / f"{name}_{VERSION}.npz", actions=np.array(actions), **seen)
-    if name in ("dqn_hindsight", "qrdqn"):
-        model.save_replay_buffer(FOLDER / f"{name}_{VERSION}.pkl")
-
-if VERSION == "1.6.2":
+for name, (algorithm, policy, env, kwargs, others) in MODELS.items():
+    if name.endswith(sb3.__version__):
+        given = {"seed": 0, "device": "cpu", "policy_kwargs": kwargs, **others}
+        model = algorithm(f"{policy}Policy", env, **given).learn(40)
+        model.save(f"{name}.zip")
+        rows = [{key: array[i] for key, array in SEEN[env].items()} for i in range(20)]
+        actions = [model.predict(row.get("", row), deterministic=True)[0] for row in rows]
+        np.savez(f"{name}.npz", actions=np.array(actions), **SEEN[env])
+        if "replay_buffer_class" in others or "n_quantiles" in kwargs:
+            model.save_replay_buffer(f"{name}.pkl")
+if sb3.__version__ == "1.6.2":
     env = VecNormalize(make_vec_env(SWING, seed=0))
-    env.observation_space.seed(0)
     env.reset()
-    env.save(str(FOLDER / f"vecnormalize_{VERSION}.pkl"))
+    env.save("vecnormalize_1.6.2.pkl")
