@@ -259,6 +259,8 @@ _MAKERS: Mapping[str, Maker] = {
     "rl_zoo3.utils.SimpleLinearSchedule": lambda made, build: AffineTransform(
         0.0, fields(made, build)["initial_value"]
     ),
+    # Of recurrent agents up to version 2.3, which begin anew with each training.
+    "sb3_contrib.common.recurrent.type_aliases.RNNStates": lambda made, build: build(made.args),
     # How protocols 0 to 2 hold bytes.
     "builtins.bytes": lambda made, build: b"".join(made.args),  # of none
     "_codecs.encode": lambda made, build: build(made.args)[0].encode("latin1"),

@@ -42,12 +42,7 @@ _NOT_KEPT = frozenset(
     | {"_vec_normalize_env", "_episode_storage"}
 )
 # The caller's as well, or rebuilt from the learning rate and the exploration settings.
-_NOT_READ = _NOT_KEPT | {
-    "_last_lstm_states",
-    "tensorboard_log",
-    "lr_schedule",
-    "exploration_schedule",
-}
+_NOT_READ = _NOT_KEPT | {"tensorboard_log", "lr_schedule", "exploration_schedule"}
 _SERIALIZED = ":serialized:"
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)

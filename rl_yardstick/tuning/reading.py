@@ -68,12 +68,12 @@ def _opened(storage: str) -> BaseStorage:
     from optuna.storages import JournalStorage, RDBStorage
     from optuna.storages.journal import JournalFileBackend
 
-    path = Path(storage.removeprefix(SQLITE))
-    is_file = "://" not in storage.removeprefix(SQLITE)
-    if not is_file or (storage == str(path) and path.suffix != ".log"):
+    place, is_journal = storage.removeprefix(SQLITE), storage.endswith(".log")
+    path = Path(place)
+    if "://" in place or (place == storage and not is_journal):
         raise UserError(f"--storage is sqlite:///FILE or a journal FILE.log, not {shown(storage)}")
     if not path.is_file():
         raise UserError(f"--storage: {path}: no such file")
-    if storage == str(path):
+    if place == storage:
         return JournalStorage(JournalFileBackend(storage))
     return RDBStorage(f"{SQLITE}file:{quote(str(path.absolute()))}?mode=ro&uri=true")
