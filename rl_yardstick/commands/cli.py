@@ -134,7 +134,7 @@ _NO_WANDB = "Weights & Biases is not supported; -tb DIR writes TensorBoard logs"
 _INSTEAD: Mapping[str, str] = {
     **dict.fromkeys(("-optimize", "--optimize-hyperparameters", "--n-trials"), _SEARCH),
     **dict.fromkeys(("--sampler", "--pruner", "--n-startup-trials", "--max-total-trials"), _SEARCH),
-    **dict.fromkeys(("--study-name", "--optimization-log-path"), _SEARCH),
+    "--optimization-log-path": _SEARCH,
     "--storage": "tune stores the trials in trials.log, in the folder of the search",
     **dict.fromkeys(("--track", "--wandb-project-name", "--wandb-entity"), _NO_WANDB),
     **dict.fromkeys(("-yaml", "--yaml-file"), "did you mean '--conf-file'?"),
@@ -228,6 +228,12 @@ _SHARED: Sequence[Flag] = (
         "library (Stable-Baselines3's own loop; the default of dqn, ppo and a2c), or for "
         "tables interpreted; the default of all others is auto",
         choices=("auto", "compiled", "library", "interpreted"),
+    ),
+    flag(
+        "--vec-normalize",
+        "VecNormalize's statistics of the model, or none (default: those of its run)",
+        Path,
+        metavar="FILE",
     ),
     flag("--device", "torch device (default: auto)", default="auto"),
     flag("--num-threads", "torch threads (1); -1 leaves it to torch", THREADS, 1),

@@ -28,7 +28,7 @@ EPILOG = """\
 examples:
   python enjoy.py --env Warehouse-v0 --algo ppo
   python enjoy.py --env Warehouse-v0 --algo sarsa --record route.gif --n-episodes 1
-  python enjoy.py logs/dqn/CartPole-v1_3/rl_model_20000_steps.zip
+  python enjoy.py rl-trained-agents/ppo/CartPole-v1_1
 """
 
 EXP_ID = whole_number(0, besides={-1: "the run without a number"})
@@ -43,8 +43,7 @@ MODEL_FLAGS: Sequence[Flag] = (
     switch("--load-best", "the model with the best evaluation in training"),
     flag("--load-checkpoint", "the checkpoint after N steps", whole_number(0)),
     switch("--load-last-checkpoint", "the last checkpoint"),
-    flag("--vec-normalize", "VecNormalize's statistics (else the model's)", Path, metavar="FILE"),
-    *shared("--device", "--num-threads", "--env-kwargs", "--gym-packages"),
+    *shared("--vec-normalize", "--device", "--num-threads", "--env-kwargs", "--gym-packages"),
 )
 FLAGS: Flags = {
     "": MODEL_FLAGS,

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 RESUMED = "this run, or the newest unfinished one of --algo and --env"
 PAGE = "learning.html"
+STORAGE = "hyperparameters of an Optuna trial in sqlite:///FILE or a journal FILE.log"
 WATCH = f"write a page that plays the training ({PAGE} in the run folder)"
 WATCHED = whole_number(1, besides={0: "the steps in which its policy improves"})
 # Flags that may stand beside --resume: none of the training itself.
@@ -55,9 +56,13 @@ FLAGS: Flags = {
         flag("--n-episodes", "episodes instead of steps", cli.BUDGET, -1),
         flag("--seed", "seed of everything (default: a random one)", cli.SEED, -1),
         *shared("--hyperparams", "--engine", "--conf-file", "--env-kwargs"),
+        flag("--storage", STORAGE, metavar="WHERE"),
+        flag("--study-name", "name of that study", metavar="NAME"),
+        flag("--trial-id", "number of that trial (default: the best)", whole_number(0)),
         several("--eval-env-kwargs", "environment arguments for evaluation only"),
         *shared("--gym-packages"),
         flag("-i --trained-agent", "zip or run folder to train further", default="", metavar="ZIP"),
+        *shared("--vec-normalize"),
         flag("--vec-env", "kind of VecEnv", default="dummy", choices=["dummy", "subproc"]),
         *shared("--device", "--num-threads"),
     ),
@@ -123,6 +128,9 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
     """Hold the folder, train, and print the result."""
     with run:
         print_header(run.console, spec)
+        if args.storage and not resumes:
+            trial = f"trial {args.trial_id} of {args.study_name} in {args.storage}"
+            run.console.print(trial, style="dim", markup=False, highlight=False, soft_wrap=True)
         if not resumes:
             run.begin(spec, {**vars(args), "seed": spec.seed}, cli.command_line())
         try:
@@ -169,6 +177,7 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
         final_episodes=args.eval_episodes,
         n_threads=args.num_threads,
         trained_agent=whole_zip(Path(args.trained_agent)) if args.trained_agent else None,
+        vec_normalize=_statistics(args),
         tensorboard_log=args.tensorboard_log or None,
         library_log=args.verbose > 1,
         watch_learning=_page(args),
@@ -198,18 +207,33 @@ def entry_from_flags(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
     for key in ("n_timesteps", "n_episodes"):
         if (budget := getattr(args, key)) > 0:
             changes[key] = budget
+    trial = trial_from_flags(args)
     try:
         entry = read_entry(args.algo, args.env, args.conf_file, changes.get("env_kwargs"))
     except UserError:
-        if not changes or args.conf_file:
+        if not (changes or trial) or args.conf_file:
             raise
         entry = {}
+    entry = override(entry, trial)
     merged = {
         key: {**(entry.get(key) or {}), **changes[key]}
         for key in ("env_kwargs", "eval_env_kwargs")
         if changes.get(key)
     }
     return training_follows(override(entry, {**changes, **merged}), changes)
+
+
+def trial_from_flags(args: argparse.Namespace) -> dict[str, Any]:
+    """The settings of the trial that is asked for, if any; its number and study become typed."""
+    if args.storage is None:
+        if args.study_name is not None or args.trial_id is not None:
+            raise UserError("--study-name and --trial-id need --storage")
+        return {}
+    from rl_yardstick.tuning.reading import settings_of_trial
+
+    found = settings_of_trial(args.algo, args.storage, args.study_name, args.trial_id)
+    settings, args.study_name, args.trial_id = found
+    return settings
 
 
 def whole_zip(path: Path) -> str:
@@ -219,6 +243,14 @@ def whole_zip(path: Path) -> str:
     path = model_in(path) if path.is_dir() else path
     zip_data(path)
     return str(path.absolute())
+
+
+def _statistics(args: argparse.Namespace) -> str | None:
+    """The absolute path of ``--vec-normalize``, or ``none``."""
+    path = args.vec_normalize
+    if path is not None and not args.trained_agent:
+        raise UserError("--vec-normalize needs --trained-agent")
+    return None if path is None else str(path if str(path) == "none" else path.absolute())
 
 
 def _page(args: argparse.Namespace) -> str | None:

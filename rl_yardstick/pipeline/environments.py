@@ -261,7 +261,11 @@ def _make_vec_env(
     if spec.normalize is not None:
         # Statistics come from training, and evaluations report returns as they are.
         fixed = {} if training else {"norm_reward": False, "training": False}
-        env = vec_env.VecNormalize(env, **{**spec.normalize, **fixed})
+        try:
+            env = vec_env.VecNormalize(env, **{**spec.normalize, **fixed})
+        except ValueError as error:  # of keys
+            what = f"normalize: {one_line(error)}"
+            raise UserError(f"{what}: the environment gives {env.observation_space}") from error
     if spec.frame_stack is not None:
         env = vec_env.VecFrameStack(env, spec.frame_stack)
     return BaseAlgorithm._wrap_env(env)

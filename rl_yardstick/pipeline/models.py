@@ -12,6 +12,7 @@ import re
 import sys
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -33,6 +34,8 @@ Which = Literal["final", "best", "last checkpoint"] | int
 MAX_MODEL = 1 << 32  # bytes of a zip
 _OTHER_ZIPS = re.compile(r"best_model\.zip|train_eval_metrics\.zip|rl_model_\d+_steps\.zip")
 REPLAY_BUFFER = "replay_buffer.pkl"
+NONE = "none"  # in place of a path: no statistics
+_BESIDE = ("vec_normalize.pkl", "vecnormalize.pkl")  # as model hubs and rl_zoo3 name statistics
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class Wanted:
     log_folder: Path = Path("logs")  #: the folder above all runs
     number: int = 0  #: of the run; 0 for the newest
     which: Which = "final"
-    statistics: Path | None = None  #: of VecNormalize, instead of those beside the model
+    statistics: Path | None = None  #: of VecNormalize, or "none"; None: those of the model
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)  #: replace those of the run
     typed: list[str] = field(default_factory=list)  #: modules that the user typed
     seed: int = 0  #: of the episodes
@@ -87,11 +90,13 @@ def find_model(wanted: Wanted) -> Model:
     check_agent(spec.algo)
     check_env_id(spec.env_id)
     statistics = wanted.statistics
-    if statistics is None and spec.normalize is not None:
+    if statistics == Path(NONE):
+        spec, statistics = spec.changed(normalize=None), None
+    elif statistics is None and spec.normalize is not None:
         statistics = statistics_of(path)
         if statistics is None and spec.normalize.get("norm_obs", True):
             fault = "trained on normalised observations, but their statistics are missing"
-            raise UserError(f"{path} was {fault}: name their file with --vec-normalize")
+            raise UserError(f"{path} was {fault}: name their file with --vec-normalize, or none")
     run = path.parent if (path.parent / RECORD).is_file() else None
     return Model(path, _as_saved(spec, data, statistics), run, statistics)
 
@@ -141,10 +146,13 @@ def model_in(folder: Path, which: Which = "final") -> Path:
 
 
 def statistics_of(model: Path) -> Path | None:
-    """The VecNormalize statistics of a model: its own, or its run's last, or a model hub's."""
-    places = [statistics_beside(model), *sorted(model.parent.glob("*/vecnormalize.pkl"))]
-    places += [model.with_name(name) for name in ("vec_normalize.pkl", "vecnormalize.pkl")]
+    """The VecNormalize statistics of a model: its own, or a model hub's, or its run's last."""
+    places = [*_closest(model), *sorted(model.parent.glob("*/vecnormalize.pkl"))]
     return next((path for path in places if path.is_file()), None)
+
+
+def _closest(model: Path) -> list[Path]:
+    return [statistics_beside(model), *(model.with_name(name) for name in _BESIDE)]
 
 
 def replay_buffer_of(model: Path) -> Path | None:
@@ -189,10 +197,10 @@ def _spec_of(path: Path, data: Mapping[str, Any], wanted: Wanted) -> TrainSpec:
     if config is None:
         check_agent(algo)
         # Whether a model was trained on normalised observations depends on the model alone.
-        try:
-            config = {**read_entry(algo, env_id), "normalize": None}
-        except UserError:
-            config = {}
+        has_statistics = not own and any(place.is_file() for place in _closest(path))
+        config = {"normalize": {} if has_statistics else None}
+        with suppress(UserError):
+            config = {**read_entry(algo, env_id), **config}
     special = special_settings(config)
     special |= {"env_kwargs": args.get("env_kwargs") or special.get("env_kwargs") or {}}
     special |= {"n_timesteps": None, "n_episodes": None, "callback": [], "n_envs": 1}
@@ -217,13 +225,19 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
     replaced: dict[str, Any] = {
         "learning_rate": 0.0,
         **dict.fromkeys(("lr_schedule", "clip_range", "clip_range_vf"), unused),
+        "delta_std_schedule": unused,
         "action_noise": None,
         "n_steps": 1,
+        "replay_buffer_class": None,  # for hindsight, it needs the environment's reward
+        "replay_buffer_kwargs": {},
     }
     if env is not None:
         saved, here = zip_data(model.path).get("observation_space"), vars(env.observation_space)
         found, needed = (
-            str(one.get("n", tuple(one.get("_shape") or ()))) if isinstance(one, dict) else ""
+            # Before version 0.20, Gym had it as ``shape``.
+            str(one.get("n", tuple(one.get("_shape", one.get("shape")) or ())))
+            if isinstance(one, dict)
+            else ""
             for one in (saved, here)
         )
         if found not in ("", needed):
@@ -254,6 +268,7 @@ def load(spec: TrainSpec, path: Path, env: VecEnv | None, **replaced: Any) -> Ba
         with warnings.catch_warnings():
             # About a buffer that the library itself has chosen.
             warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
+            warnings.filterwarnings("ignore", "You are probably loading a")  # older model
             classes = _own_classes(algorithm, spec.gym_packages)
             return load_model(algorithm, content, env, classes=classes, **replaced)  # type: ignore[no-any-return]
     except UserError:
@@ -329,7 +344,8 @@ def take_statistics(env: Any, path: Path) -> None:
         there, here = ({key: one.mean.shape for key, one in rms.items()} for rms in given)
         if here != there:
             fault = f"holds statistics of observations of shape {there.get('', there)}"
-            raise UserError(f"{path} {fault}; the environment gives {here.get('', here)}")
+            here_it_is = f"the environment gives {here.get('', here)}"
+            raise UserError(f"{path} {fault}; {here_it_is}: --vec-normalize FILE, or none")
         inside.obs_rms = saved.obs_rms
     inside.ret_rms = saved.ret_rms
 
@@ -337,14 +353,13 @@ def take_statistics(env: Any, path: Path) -> None:
 def begun_with(spec: TrainSpec) -> TrainSpec:
     """The spec of a training that begins with an agent, with its masks and its normalisation."""
     path = Path(spec.trained_agent or "")
-    data = zip_data(path)
-    return _as_saved(spec, data, _own_statistics(spec, path, data))
-
-
-def _own_statistics(spec: TrainSpec, path: Path, data: Mapping[str, Any]) -> Path | None:
-    """The VecNormalize statistics of a zip, if its own settings have ``normalize``."""
+    data, given = zip_data(path), spec.vec_normalize
     wanted = Wanted(algo=spec.algo, env_id=spec.env_id, typed=spec.gym_packages)
-    return None if _spec_of(path, data, wanted).normalize is None else statistics_of(path)
+    if given is None and _spec_of(path, data, wanted).normalize is not None:
+        found = statistics_of(path)
+        given = None if found is None else str(found.absolute())
+    statistics = None if given in (None, NONE) else Path(given)
+    return _as_saved(spec, data, statistics).changed(vec_normalize=given)
 
 
 def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorithm:
@@ -361,9 +376,8 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
         # The library chooses the buffer's class by ``n_steps``, and would keep the file's class.
         given = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, **given}
     agent: Any = load(spec, path, env, **given)
-    statistics = _own_statistics(spec, path, zip_data(path))
-    if statistics is not None and agent.get_vec_normalize_env():
-        take_statistics(env, statistics)
+    if spec.vec_normalize not in (None, NONE) and agent.get_vec_normalize_env():
+        take_statistics(env, Path(spec.vec_normalize))
     buffer = replay_buffer_of(path)
     if buffer is None or not issubclass(load_algorithm(spec.algo), OffPolicyAlgorithm):
         return agent  # type: ignore[no-any-return]

@@ -29,7 +29,7 @@ from rl_yardstick.pipeline.components import (
     check_arguments,
     digests_of,
 )
-from rl_yardstick.pipeline.errors import UserError, shown, unknown
+from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec, validated
 
@@ -120,6 +120,7 @@ def read_entry(
     Atari games without an entry use the entry ``atari``, all others ``default``; an agent without
     a file an empty one. If ``env_kwargs`` make the environment equal to another id, that id's entry
     is used: for CliffWalking-v1 with ``is_slippery: True``, the entry of CliffWalkingSlippery-v1.
+    Another file may also be a single entry, or the parameters of a trial; see `from_trial`.
     """
     from gymnasium import registry
 
@@ -132,6 +133,11 @@ def read_entry(
         named = [registry[name] for name in entries if name in registry]
         same = [s.id for s in named if (s.entry_point, s.kwargs, s.max_episode_steps) == meant]
         key = same[0] if same else key
+    if key is None and not {*arguments_of(algo), *SPECIAL}.isdisjoint(entries):
+        try:  # one entry without an id, as in rl_zoo3's config.yml
+            return from_trial(algo, entries)
+        except (TypeError, LookupError) as error:
+            raise UserError(f"{path}: these are no hyperparameters: {one_line(error)}") from error
     if key is None:
         way_out = "give hyperparameters with -params, or another file with --conf-file"
         raise UserError(f"{unknown(f'{path}: no entry for', env_id, entries, n=3)}; {way_out}")
@@ -166,6 +172,75 @@ def entry_names(algo: str) -> list[str]:
     text = read_text(path) if path.is_file() else ""
     names = re.findall(r"^([\w./-]+):", text, re.MULTILINE)
     return [name for name in names if name not in ("default", "atari", TUNED_ON)]
+
+
+# --- trials of rl_zoo3 ----------------------------------------------------------------------------
+
+_WIDTHS = {"tiny": [64], "small": [64, 64], "medium": [256, 256], "big": [400, 300]}
+_WIDTHS |= {"large": [256, 256, 256], "verybig": [512, 512, 512]}
+_ACTIVATIONS = {"tanh": "nn.Tanh", "relu": "nn.ReLU", "elu": "nn.ELU", "leaky_relu": "nn.LeakyReLU"}
+_INSIDE = {
+    "policy_kwargs": "net_arch activation_fn ortho_init log_std_init sde_net_arch n_quantiles "
+    "lstm_hidden_size enable_critic_lstm",
+    "replay_buffer_kwargs": "n_sampled_goal goal_selection_strategy",
+}
+_WITH_TWO_NETWORKS = ("ppo", "ppo_lstm", "ppo_mask", "trpo", "a2c")
+# What the first versions, which sampled gamma itself, set without sampling it.
+_NO_ORTHOGONAL, _AUTO_ENTROPY = (
+    {"ortho_init": False},
+    {"ent_coef": "auto", "target_entropy": "auto"},
+)
+_UNSAMPLED: Mapping[str, dict[str, Any]] = {
+    **dict.fromkeys(("ppo", "ppo_lstm", "trpo"), _NO_ORTHOGONAL),
+    **dict.fromkeys(("sac", "tqc"), _AUTO_ENTROPY),
+}
+
+
+def from_trial(algo: str, params: Mapping[str, Any]) -> dict[str, Any]:
+    """The hyperparameters of the parameters that rl_zoo3's search samples, in any of its versions.
+
+    Others are left as they are, so a whole entry comes out as it is. Raises UserError for a word
+    that rl_zoo3 does not have.
+    """
+    found = _decoded(params)
+    if algo in _WITH_TWO_NETWORKS and isinstance(found.get("net_arch"), list):
+        found["net_arch"] = {"pi": found["net_arch"], "vf": found["net_arch"]}
+    is_old = "gamma" in params and "net_arch" in params
+    if is_old and algo in _UNSAMPLED:
+        found = {**_UNSAMPLED[algo], **found}
+    if is_old and "n_steps" in found and "batch_size" in found:
+        found["batch_size"] = min(found["batch_size"], found["n_steps"])
+    if "net_arch" in params and "train_freq" in found:
+        n_updates = max(found["train_freq"] // found.pop("subsample_steps", 1), 1)
+        found.setdefault("gradient_steps", n_updates)
+    if "top_frac_size" in found:
+        found["n_top"] = max(int(found.pop("top_frac_size") * found["n_delta"]), 1)
+    if found.pop("lr_schedule", "constant") == "linear":
+        found["learning_rate"] = f"lin_{found['learning_rate']}"
+    if found.get("noise_type", "") is None:
+        found = {key: value for key, value in found.items() if key[:6] != "noise_"}
+    for outer, names in _INSIDE.items():
+        if inner := {name: found.pop(name) for name in names.split() if name in found}:
+            found[outer] = {**(found.get(outer) or {}), **inner}
+    return found
+
+
+def _decoded(params: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters with their words, powers and differences replaced by values."""
+    found = {name: _read_dict(value) for name, value in params.items()}
+    for name, value in params.items():
+        is_rest, is_power = name.startswith("one_minus_"), name.endswith("_pow")
+        if is_rest or is_power:
+            if not (isinstance(value, int | float) and 0 <= value < 64):
+                raise UserError(f"{name}: must be a number from 0 to 63, not {shown(value)}")
+            short = name.removeprefix("one_minus_").removesuffix("_pow")
+            found[short] = 1 - found.pop(name) if is_rest else 2 ** found.pop(name)
+    for name, table in (("net_arch", _WIDTHS), ("activation_fn", _ACTIVATIONS)):
+        if isinstance(word := found.get(name), str):
+            if word not in table:
+                raise unknown(f"a trial of rl_zoo3 has no {name}", word, table)
+            found[name] = table[word]
+    return found
 
 
 # --- what is typed --------------------------------------------------------------------------------

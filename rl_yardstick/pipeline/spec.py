@@ -47,6 +47,7 @@ class TrainSpec(BaseModel):
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None  #: action noise
     noise_std: float | None = Field(None, ge=0)  #: its standard deviation
     trained_agent: str | None = None  #: path of the zip to begin with
+    vec_normalize: str | None = None  #: path of its statistics, or none; None: those beside it
     eval_freq: int | None = None  #: steps between evaluations; None: twenty in all; -1: none
     eval_episodes: PositiveInt | None = None  #: of a sampled evaluation; None: adaptive
     final_episodes: PositiveInt | None = None  #: of the one at the end, likewise

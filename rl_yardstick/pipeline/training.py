@@ -32,7 +32,7 @@ from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
 from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 from rl_yardstick.pipeline.finite_numbers import NumberWatch, check_model
-from rl_yardstick.pipeline.models import REPLAY_BUFFER, begun_with, load_to_train
+from rl_yardstick.pipeline.models import NONE, REPLAY_BUFFER, begun_with, load_to_train
 from rl_yardstick.pipeline.pictures import draw
 from rl_yardstick.pipeline.run import FAILED, FINISHED, INTERRUPTED, Run, save_agent
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -63,6 +63,8 @@ def train(
     spec = spec if spec.trained_agent is None else begun_with(spec)
     asked = spec  # recorded without what the environment needs
     spec, notes = tried(spec)
+    if spec.vec_normalize not in (None, NONE):
+        notes = [f"normalised by the statistics in {spec.vec_normalize}", *notes]
     for note in notes:
         run.console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     resumes = resumes and run.state_path.exists()

@@ -42,7 +42,10 @@ def load_replay_buffer(
     buffer = read_pickle(content_of(path, _MAX_BYTES), makers=makers)
     if not isinstance(buffer, ReplayBuffer):
         raise UnsafeFileError("holds no replay buffer")
-    state = vars(buffer)
+    state, like = vars(buffer), model.replay_buffer
+    if type(like) is type(buffer) and (lacks := vars(like).keys() - state):  # hindsight, before 1.8
+        name = f"{type(buffer).__name__} of an older version"
+        raise UnsafeFileError(f"holds a {name}, without {', '.join(sorted(lacks))}")
     for name in ("observation_space", "action_space"):
         if state.get(name) != getattr(model, name):
             raise UnsafeFileError(f"holds transitions of another {name} than the agent's")

@@ -66,6 +66,7 @@ _OF_NUMPY: Mapping[str, Maker] = {
     "numpy.random._pickle.__generator_ctor": _generator,
     # The legacy generator of Gym's spaces: Gymnasium's make a new one.
     "numpy.random._pickle.__randomstate_ctor": lambda made, build: None,
+    "gym.utils.seeding.RandomNumberGenerator._generator_ctor": lambda made, build: None,
 }
 _CLASSES_OF_NUMPY: Mapping[str, type] = {
     f"numpy.{kind.__name__}": kind
@@ -83,14 +84,15 @@ _DTYPES: Mapping[str, th.dtype] = {
 } | {"torch.ByteStorage": th.uint8, "torch.CharStorage": th.int8}
 
 
+_STREAM = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."  # its magic number, of PyTorch before 1.6
+
+
 def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
     """Load a ``.pth`` file: tensors in dictionaries and lists."""
     budget = budget or Budget(len(content))
     storages: dict[str, th.Tensor] = {}
     try:
-        # The name of a member begins with that of a folder.
-        records = read_members(content, budget).items()
-        members = {name.partition("/")[2]: record for name, record in records}
+        tree, members = _records(content, budget)
 
         def storage(made: Made, build: Build) -> th.Tensor:
             """A storage, which the file may name several times."""
@@ -102,10 +104,31 @@ def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
             budget.charge(storages[key].nbytes)
             return storages[key]
 
-        tree = pickles.Reader(io.BytesIO(members.get("data.pkl", b"")), budget).load()
         return Build({**_OF_TENSORS, pickles.PERSISTENT_ID: storage}, {}, budget)(tree)
-    except UnsafeFileError as error:
+    except Exception as error:  # a damaged file can fail anywhere
         raise UnsafeFileError(f"holds tensors that cannot be read: {error}") from error
+
+
+def _records(content: bytes, budget: Budget) -> tuple[Any, dict[str, bytes]]:
+    """The recorded tree of a ``.pth`` file, and its members: the storages by ``data/KEY``."""
+    file = io.BytesIO(content)
+    reader = pickles.Reader(file, budget)
+    if content.startswith(_STREAM):  # five pickles, then a size and the bytes for each key
+        budget.charge(len(content))
+        _, _, _, tree, keys = (reader.load() for _ in range(5))
+        kinds = {str(key): kind for _, kind, key, *_ in reader.persistent_ids if type(key) is str}
+        members = {}
+        for key in map(str, keys):
+            size, width = int.from_bytes(file.read(8), "little"), _DTYPES[kinds[key].name].itemsize
+            record = file.read(min(size, len(content)) * width)
+            if len(record) != size * width:
+                raise UnsafeFileError("a storage that is cut off")
+            members[f"data/{key}"] = record
+        return tree, members
+    # The name of a member begins with that of a folder.
+    records = read_members(content, budget).items()
+    members = {name.partition("/")[2]: record for name, record in records}
+    return pickles.Reader(io.BytesIO(members.get("data.pkl", b"")), budget).load(), members
 
 
 def _flat(pid: Any, content: bytes) -> th.Tensor:
@@ -169,11 +192,18 @@ def check_values(files: Mapping[str, Any]) -> None:
 _FILLED = (
     *(ConstantSchedule, LinearSchedule, FloatSchedule),
     *(AffineTransform, ComposeTransform, ExpTransform),  # schedules such as exp(a + b x)
-    *(noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise),
+    noise.VectorizedActionNoise,
     *(spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary),
     *(spaces.Dict, spaces.Tuple, RunningMeanStd),
 )
+_NOISES = (noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise)
 _CALLED = (TrainFreq, TrainFrequencyUnit, GoalSelectionStrategy)
+
+
+def _noise(cls: Any, made: Made, build: Build) -> Any:
+    new = filled(cls, made, build)
+    vars(new).setdefault("_dtype", np.float32)  # which the library lacked before version 1.7
+    return new
 
 
 def _called(make: Callable[..., Any], made: Made, build: Build) -> Any:
@@ -184,12 +214,18 @@ _MAKERS: Mapping[str, Maker] = {
     **_OF_TENSORS,
     **_OF_NUMPY,
     **{name: partial(filled, cls) for name, cls in by_name(_FILLED).items()},
+    **{name: partial(_noise, cls) for name, cls in by_name(_NOISES).items()},
     **{name: partial(_called, cls) for name, cls in by_name(_CALLED).items()},
     # The arguments are its contents, always empty, and its maximum length.
     "collections.deque": lambda made, build: deque(build(made.items), *build(made.args[1:2])),
     "rl_zoo3.utils.SimpleLinearSchedule": lambda made, build: AffineTransform(
         0.0, fields(made, build)["initial_value"]
     ),
+    # Of recurrent agents up to version 2.3, which begin anew with each training.
+    "sb3_contrib.common.recurrent.type_aliases.RNNStates": lambda made, build: build(made.args),
+    # How protocols 0 to 2 hold bytes.
+    "builtins.bytes": lambda made, build: b"".join(made.args),  # of none
+    "_codecs.encode": lambda made, build: build(made.args)[0].encode("latin1"),
     "torch.device": lambda made, build: th.device("cpu"),  # the caller chooses
 }
 

@@ -33,6 +33,7 @@ from rl_yardstick.safe_files.known_objects import (
     read_pickle,
     tensors_in,
 )
+from rl_yardstick.safe_files.old_versions import update
 from rl_yardstick.safe_files.pickles import Reader
 
 # Attributes that models do not keep: the caller sets them, regardless of the file.
@@ -92,6 +93,8 @@ def load_model(
     tensors = {name: load_tensors(members.pop(name), budget) for name in names}
     check_values(tensors)
     try:
+        changes = update(tensors, {**settings, **objects, **replaced})
+        objects |= {key: value for key, value in changes.items() if key not in replaced}
         _check_variables(tensors, algorithm)
         _check_buffers({**settings, **objects, **replaced})
         # The library applies only custom objects whose keys are in the file.
@@ -106,7 +109,7 @@ def load_model(
         with charged_tensors(budget):
             return algorithm.load(checked, env, device, objects, **replaced)
     except ValueError:
-        raise  # the model does not fit the environment
+        raise  # UnsafeFileError, or the model does not fit the environment
     except Exception as error:  # settings and weights that do not match can fail anywhere
         reason = textwrap.shorten(str(error), 200) or type(error).__name__
         raise UnsafeFileError(f"holds no such model: {reason}") from error

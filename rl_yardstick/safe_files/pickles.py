@@ -15,9 +15,10 @@ from typing import Any, ClassVar
 
 from rl_yardstick.safe_files.files import Budget, UnsafeFileError, shown
 
-# The instructions of protocols 2 to 5, without sets, extension codes, out-of-band buffers, and
-# keyword arguments.
+# The instructions of protocols 0 to 5, without frozen sets, extension codes, out-of-band buffers,
+# Python 2's texts, and keyword arguments.
 _NAMES = (
+    "INT LONG FLOAT UNICODE LIST DICT PUT GET EMPTY_SET ADDITEMS "
     "PROTO FRAME STOP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 LONG4 BINFLOAT "
     "SHORT_BINUNICODE BINUNICODE BINUNICODE8 SHORT_BINBYTES BINBYTES BINBYTES8 BYTEARRAY8 "
     "EMPTY_LIST EMPTY_TUPLE EMPTY_DICT TUPLE TUPLE1 TUPLE2 TUPLE3 MARK POP POP_MARK APPEND APPENDS "
@@ -32,8 +33,10 @@ MAX_DEPTH, MAX_INTEGER_BITS = 40, 128
 _END_OF_KEYS = (1 << 61) - 1  # larger integers are not their own hash: any number can share one
 # Packages that were renamed: NumPy's inner one, and Gym, whose spaces Gymnasium took over.
 _RENAMED = {"numpy.core.": "numpy._core.", "gym.spaces.": "gymnasium.spaces."}
+_RENAMED |= {"copy_reg.": "copyreg.", "__builtin__.": "builtins."}  # in protocols 0 to 2
 # The names of records of dictionaries and of persistent ids. Names in a file have a dot.
 DICTIONARY, PERSISTENT_ID = "dict", "persistent id"
+_NEW_OBJECT = "copyreg._reconstructor"  # how protocols 0 and 1 make an object
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +58,8 @@ class Made:
     def append(self, item: Any) -> None:
         self.items.append(item)
 
+    add = append  # which sets have
+
     def __setitem__(self, key: Any, value: Any) -> None:
         self.items += (key, value)
 
@@ -65,12 +70,14 @@ class Reader(pickle._Unpickler):
     instructions: ClassVar[frozenset[str]] = INSTRUCTIONS
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
     append: Callable[[Any], None]
+    pop_mark: Callable[[], list[Any]]
     stack: list[Any]
 
     def __init__(self, file: io.BytesIO, budget: Budget) -> None:
         super().__init__(file)
         self.file, self.budget = file, budget
         self.names: set[str] = set()  # all names in the file
+        self.persistent_ids: list[Any] = []
 
     def load(self) -> Any:
         """Read the next pickle of the file as lists, tuples, names, records, and plain data."""
@@ -105,15 +112,27 @@ class Reader(pickle._Unpickler):
         return Name(full)
 
     def persistent_load(self, pid: Any) -> Made:
+        self.persistent_ids.append(pid)
         return Made(PERSISTENT_ID, (pid,))
 
     def load_dictionary(self) -> None:
         self.append(Made(DICTIONARY, ()))  # hashing the keys could take for ever
 
+    def load_set(self) -> None:
+        self.append(Made("set", ()))  # no file needs one, but `VecNormalize` may have one inside
+
+    def load_filled_dictionary(self) -> None:
+        items = self.pop_mark()
+        if len(items) % 2:
+            raise UnsafeFileError("a dictionary with a key that has no value")
+        self.append(Made(DICTIONARY, (), items=items))
+
     def load_call(self) -> None:
         args, name = self.stack.pop(), self.stack.pop()
         if not (isinstance(name, Name) and isinstance(args, tuple)):
             raise UnsafeFileError("a pickle that calls something that is not a name")
+        if name.name == _NEW_OBJECT and args and isinstance(args[0], Name):
+            name, args = args[0], ()  # the rest are a base class and its state, of no use
         self.append(Made(name.name, args))
 
     def load_state(self) -> None:
@@ -123,6 +142,8 @@ class Reader(pickle._Unpickler):
         top.state = state
 
     dispatch[pickle.EMPTY_DICT[0]] = load_dictionary
+    dispatch[pickle.EMPTY_SET[0]] = load_set
+    dispatch[pickle.DICT[0]] = load_filled_dictionary
     dispatch[pickle.REDUCE[0]] = dispatch[pickle.NEWOBJ[0]] = load_call
     dispatch[pickle.BUILD[0]] = load_state
 

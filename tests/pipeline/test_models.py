@@ -1,5 +1,6 @@
 """Which model is played or trained further, what belongs to it, and folders of others."""
 
+import io
 import pickle
 from collections import OrderedDict
 from pathlib import Path
@@ -7,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
 
@@ -116,6 +119,45 @@ def test_statistics_go_on_unless_the_new_entry_has_none(normalised, tmp_path):
     assert train_to(tmp_path / "off", "a2c", SMALL_A2C, 40, **fields).spec().normalize is None
     run = train_to(tmp_path / "new", "a2c", {**SMALL_A2C, "normalize": {}}, 40, **fields)
     assert seen(run.path / CART / "vecnormalize.pkl") == 42
+
+
+@pytest.mark.parametrize("name", ["vec_normalize.pkl", f"{CART}/vecnormalize.pkl"])
+def test_statistics_beside_a_lone_zip_are_its_own(normalised, tmp_path, name):
+    saved, lone = tmp_path / name, {"path": tmp_path / f"{CART}.zip", "algo": "a2c", "env_id": CART}
+    lone["path"].write_bytes((normalised.path / f"{CART}.zip").read_bytes())
+    for place in (saved, other := tmp_path / "another" / "vecnormalize.pkl"):
+        place.parent.mkdir(exist_ok=True)
+        place.write_bytes((normalised.path / CART / "vecnormalize.pkl").read_bytes())
+    assert other.exists()
+    found = find_model(Wanted(**lone))
+    assert (found.statistics, found.spec.normalize["clip_obs"]) == (saved, 3.0)
+    saved.unlink()
+    for wanted in (Wanted(**lone), Wanted(normalised.path, statistics=Path("none"))):
+        found = find_model(wanted)
+        assert (found.statistics, found.spec.normalize) == (None, None)
+
+
+def test_statistics_of_other_observations_are_refused_with_a_way_out(normalised, tmp_path):
+    path = tmp_path / "other.pkl"
+    for other, keys, said in (
+        ("Pendulum-v1", None, r"\(3,\); the environment gives \(4,\): --vec-normalize"),
+        (SimpleMultiObsEnv, ["vec"], r"normalize: `norm_obs_keys` .* the environment gives Box"),
+    ):
+        VecNormalize(make_vec_env(other), norm_obs_keys=keys).save(str(path))
+        with pytest.raises(UserError, match=said):
+            returns_of(Wanted(normalised.path, statistics=path), 1)
+
+
+def test_a_training_begins_with_the_statistics_that_it_names(normalised, tmp_path):
+    begun = {"trained_agent": str(normalised.path / "rl_model_60_steps.zip"), "eval_freq": -1}
+    last, console = normalised.path / CART / "vecnormalize.pkl", Console(file=io.StringIO())
+    console.width = 300
+    spec = spec_of("a2c", CART, SMALL_A2C, n_timesteps=40, vec_normalize=str(last), **begun)
+    run, _ = run_of(spec, tmp_path, console=console)
+    assert f"note: normalised by the statistics in {last}\n" in console.file.getvalue()
+    assert seen(run.path / CART / "vecnormalize.pkl") == 202 + 42
+    run = train_to(tmp_path, "a2c", SMALL_A2C, 40, vec_normalize="none", **begun)
+    assert run.spec().normalize is None
 
 
 def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tmp_path):
