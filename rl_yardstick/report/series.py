@@ -17,6 +17,7 @@ from scipy import special
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.bandits import QUANTILES, PullStatistics
 from rl_yardstick.experiments.results import (
+    KINDS,
     StudyResults,
     curves_by_agent,
     mean_curve,
@@ -96,7 +97,6 @@ def numeric_sweeps(
     return found
 
 
-KINDS = ("evaluation", "training")
 AXES = ("step", "episode", "seconds")
 
 
