@@ -138,6 +138,10 @@ def main() -> int:
     cli.import_typed(args)
     if args.logged or args.policy:
         return compare_on_log(args)
+    from rl_yardstick.experiments.study import METRICS
+
+    if args.metric is not None and args.metric not in METRICS:
+        raise unknown("--metric: unknown metric", args.metric, METRICS)
     if is_logs(args.study):
         return judge_logs(args, stop)
     if args.pattern or args.columns:
@@ -183,10 +187,6 @@ def is_logs(words: Sequence[str]) -> bool:
 def judge_logs(args: argparse.Namespace, stop: Stop) -> int:
     """Judge finished runs by their logs, write tables and page; return the exit code."""
     cli.check_alone(build_parser(), _BESIDE_LOGS, "logs: their runs are finished")
-    columns = dict(word.partition("=")[::2] for word in args.columns)
-    known = ("agent", "env", "seed", "step", "score")
-    if wrong := [name for name in columns if name not in known or not columns[name]]:
-        raise UserError(f"--columns {wrong[0]}: name {', '.join(known)}, as score=reward")
     if len(args.env or ()) > 1:
         raise UserError("--env names the environment of logs that name none: give one")
     from rl_yardstick.commands.terminal import table_console
@@ -195,15 +195,11 @@ def judge_logs(args: argparse.Namespace, stop: Stop) -> int:
     from rl_yardstick.experiments.study import file_name
     from rl_yardstick.pipeline.settings import parse_assignments
 
-    options = Options(
-        pattern=args.pattern,
-        columns=columns,
-        env=(args.env or [""])[0],
-        env_kwargs=parse_assignments(args.env_kwargs, "--env-kwargs"),
-        gym_packages=tuple(args.gym_packages),
-        metric=args.metric or "final",
-        margin=args.margin,
-    )
+    columns = dict(word.partition("=")[::2] for word in args.columns)
+    kwargs = parse_assignments(args.env_kwargs, "--env-kwargs")
+    env, metric = (args.env or [Options.env])[0], args.metric or Options.metric
+    figures = tuple(args.figures or Options.figures)
+    options = Options(args.pattern, columns, env, kwargs, metric, args.margin, figures)
     console, paths = table_console(), [Path(word) for word in args.study]
     root = Path(args.log_folder) / (args.name or file_name(paths[0].absolute().stem))
     if (root / "study.json").exists():
@@ -211,16 +207,12 @@ def judge_logs(args: argparse.Namespace, stop: Stop) -> int:
     with console.status("reading the logs"):
         found = find_logs(paths, columns)
         results = results_of(found, options, root)
-    if args.figures:
-        results = replace(results, study=replace(results.study, figures=tuple(args.figures)))
-    console.print(results.study.title, style="bold")
-    for note in found.notes:
-        console.print(note)
+    for line in (results.study.title, *found.notes):
+        console.print(line)
     workers = workers_of(args, root, None)
     with held(root), workers:
-        _judge(
-            Job(root, cli.command_line(), console, stop, workers, not args.no_report), results, ()
-        )
+        job = Job(root, cli.command_line(), console, stop, workers, not args.no_report)
+        _judge(job, results, ())
     return 0
 
 
@@ -456,7 +448,6 @@ _BESIDE_RESUME = {"resume", "gym_packages", "jobs", "cluster", "no_report", "log
 def study_spec(args: argparse.Namespace) -> StudySpec:
     """The study that the arguments select, with their changes."""
     from rl_yardstick.experiments.study import (
-        METRICS,
         StudySpec,
         find_study,
         read_study,
@@ -469,8 +460,6 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
         raise UserError("--until-decided and --quick do not go together: give one of them")
     if args.learning_pages and args.no_report:
         raise UserError("--watch-learning is a section of the page: leave out --no-report")
-    if args.metric is not None and args.metric not in METRICS:
-        raise unknown("--metric: unknown metric", args.metric, METRICS)
     cli.check_tensorboard(args.tensorboard)
     if not args.study:
         study = _study_of_flags(args)

@@ -13,53 +13,30 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import numpy as np
 import pandas as pd
 
 from rl_yardstick.experiments.analysis import StudyAnalysis, analyse
-from rl_yardstick.experiments.logs import (
-    EVALUATION,
-    FINAL,
-    TRAINING,
-    Found,
-    Log,
-    find_logs,
-    table_logs,
-)
+from rl_yardstick.experiments.logs import FINAL, WORDS, Found, Log, find_logs, table_logs
 from rl_yardstick.experiments.plan import PlannedRun
-from rl_yardstick.experiments.pool import do_aside
 from rl_yardstick.experiments.results import (
     HIDDEN_COLUMNS,
-    KINDS,
-    LAST_EPISODES,
     OF_RUN,
     RUN_COLUMNS,
     Curve,
-    Episodes,
     StudyResults,
+    evaluation_curve,
     joined,
-    logged_curve,
     summary_row,
     training_curve,
 )
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, Metric, StudySpec
-from rl_yardstick.pipeline.components import import_modules
-from rl_yardstick.pipeline.environments import MISTAKES, make_single_env
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.environments import MISTAKES
+from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
-from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec, validated
 
-WORDS = {
-    FINAL: "return of the final policy",
-    EVALUATION: "mean return of the last evaluation",
-    TRAINING: f"mean return of the last {LAST_EPISODES} training episodes",
-}
-# Gymnasium's ids, and seeds with a word before them.
-_FORMS = {
-    "agent": "[^/]+?",
-    "env": r"[A-Za-z0-9.-]+-v\d+",
-    "seed": r"(?:(?:seed|run|s)[-_=]?)?\d+",
-}
+# Regular expressions of labels in paths: of ids of Gymnasium, and of seeds with a word before them.
+FORMS = {"agent": "[^/]+?", "env": r"[A-Za-z0-9.-]+-v\d+", "seed": r"(?:(?:seed|run|s)[-_=]?)?\d+"}
 # The first that fits the end of a path is taken.
 PATTERNS = (
     *("{agent}/{env}_{seed}", "{agent}/{env}/{seed}", "{env}/{agent}/{seed}"),
@@ -67,7 +44,6 @@ PATTERNS = (
     *("{env}_{agent}_{seed}", "{agent}/{env}", "{env}/{agent}", "{agent}/{seed}"),
     *("{agent}_{seed}", "{agent}"),
 )
-UNNAMED = "environment"  # one that no log names
 
 
 @dataclass(frozen=True)
@@ -76,11 +52,14 @@ class Options:
 
     pattern: str = ""  #: where paths have agent, env and seed; empty for one of `PATTERNS`
     columns: Mapping[str, str] = field(default_factory=dict)  #: a table's own, by the usual names
-    env: str = ""  #: the environment of runs whose logs name none
+    env: str = "environment"  #: the environment of runs whose logs name none
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)  #: its arguments, for the optimum
-    gym_packages: tuple[str, ...] = ()  #: modules with further environments
     metric: Metric = "final"  #: the figure that verdicts compare
     margin: float | None = None  #: the difference within which agents are tied
+    figures: tuple[str, ...] = ("png", "svg")  #: formats of figures
+
+
+# --- agent, environment and seed ------------------------------------------------------------------
 
 
 class _Run(NamedTuple):
@@ -90,18 +69,15 @@ class _Run(NamedTuple):
     log: Log
 
 
-# --- agent, environment and seed ------------------------------------------------------------------
-
-
 def labels_in(place: str, pattern: str, forms: Mapping[str, str]) -> dict[str, str] | None:
-    """The labels at the end of a path, by a pattern; None if it does not fit.
+    """The labels at the end of a path, or None if the pattern, in which ``*`` is any text, fails.
 
-    ``forms`` has a regular expression for each of agent, env and seed. ``*`` is any text.
+    ``forms`` has a regular expression for each label.
     """
     text, *others = re.split(r"\{(\w*)\}", pattern)
     names, regex = others[::2], re.escape(text)
     if "agent" not in names or len({*names}) < len(names) or not {*names} <= {*forms}:
-        raise UserError(f"--pattern {pattern} must name agent, env, seed: '{PATTERNS[0]}'")
+        raise UserError(f"--pattern {pattern}: name agent, env and seed, as in {PATTERNS[0]}")
     for name, text in zip(names, others[1::2], strict=True):
         regex += f"(?P<{name}>{forms[name]}){re.escape(text)}"
     found = re.search("(?:^|/)" + regex.replace(r"\*", "[^/]*") + "$", place.replace("\\", "/"))
@@ -110,11 +86,10 @@ def labels_in(place: str, pattern: str, forms: Mapping[str, str]) -> dict[str, s
 
 def _labelled(found: Found, options: Options) -> list[_Run]:
     """The logs with their labels, in order, one for each agent, environment and seed."""
-    patterns, forms = PATTERNS, _FORMS
-    if options.pattern:
-        patterns, forms = (options.pattern,), {**_FORMS, "env": "[^/]+?"}
-    used, runs = dict[str, list[str]](), dict[Any, _Run]()
-    for log in sorted(found.logs, key=lambda log: log.has_events_only):
+    patterns = (options.pattern,) if options.pattern else PATTERNS
+    forms = {**FORMS, "env": "[^/]+?"} if options.pattern else FORMS
+    used, runs = Counter[str](), dict[Any, _Run]()
+    for log in sorted(found.logs, key=lambda log: log.is_of_events):
         labels = dict(log.labels)
         if "agent" not in labels:
             place = str(log.path.with_suffix("")) if labels else log.place
@@ -123,21 +98,18 @@ def _labelled(found: Found, options: Options) -> list[_Run]:
             if in_path is None:
                 raise UserError(f"--pattern {options.pattern} does not fit {place}")
             labels = {**in_path, **labels}
-            told = " ".join(f"{key}={labels[key]}" for key in forms if key in in_path)
-            used.setdefault(pattern, []).append(told)
-        place = labels.get("env") or log.env or options.env or UNNAMED
-        run = _Run(labels["agent"], place, re.sub("^.*[a-z_=-]", "", labels.get("seed", "")), log)
-        key = run[:3] if run.seed else (*run[:2], log.place)
-        if key not in runs:
-            runs[key] = run
-        elif not log.has_events_only:
+            used[pattern] += 1
+        seed = re.sub(r"^\D+(?=\d+$)", "", labels.get("seed", ""))
+        run = _Run(labels["agent"], labels.get("env") or log.env or options.env, seed, log)
+        key = run[:3] if seed else (*run[:2], log.place)
+        if key in runs and not log.is_of_events:
             both = f"{runs[key].log.place} and {log.place}"
-            raise UserError(f"two runs are {', '.join(run[:3])}: {both}: --pattern splits them")
-    for pattern, all_told in used.items():
-        which = f"{len(all_told):,} run{'s' * (len(all_told) > 1)}, as {all_told[0]}"
-        found.notes.append(f"labels from paths by --pattern '{pattern}': {which}")
+            raise UserError(f"two runs are {', '.join(run[:3])}: {both}; --pattern splits them")
+        runs.setdefault(key, run)
+    for pattern, n in used.items():
+        found.notes.append(f"labels of {n:,} from their paths, by --pattern '{pattern}'")
     if n := sum(not run.seed for run in runs.values()):
-        found.notes.append(f"{n:,} runs have no seed and are numbered in their order")
+        found.notes.append(f"{n:,} runs without a seed are numbered in their order")
     return sorted(runs.values(), key=lambda run: (*run[:2], run.seed.zfill(20)))
 
 
@@ -154,131 +126,94 @@ def results_of(found: Found, options: Options, root: Path) -> StudyResults:
     counts = Counter(kind for run in every for kind in run.log.figures)
     kind = max([*WORDS, *counts], key=lambda kind: counts[kind])  # the first that most runs have
     runs = [run for run in every if kind in run.log.figures]
-    has_lines = any(kind in run.log.lines for run in runs)
-    words = WORDS.get(kind) or f"{'last ' if has_lines else ''}{kind}"
-    notes.append(f"figure of each run: {words}")
+    is_last = any(len(run.log.evaluations.steps) for run in runs)
+    words = WORDS.get(kind) or f"{'last ' if is_last else ''}{kind}"
+    notes.append(f"figure of each run: {'mean ' if kind in WORDS else ''}{words}")
     if n := len(every) - len(runs):
-        first = next(run.log.place for run in every if kind not in run.log.figures)
-        notes.append(f"left out: {n:,} run{'s' * (n > 1)} without it, such as {first}")
-    agents, places = (list(dict.fromkeys(run[k] for run in runs)) for k in (0, 1))
+        notes.append(f"left out: {n:,} run{'s' * (n > 1)} without such a figure")
+    agents = list(dict.fromkeys(run.agent for run in runs))
     if len(agents) == 1:
         notes.append(f"one agent only, {agents[0]}: a comparison needs two")
-    specs = {place: _spec(place, runs, options) for place in places}
-    known = [spec for spec in specs.values() if spec.env_id]
-    aside = known and "torch" not in sys.modules
-    scales = do_aside(yardsticks_of, known) if aside else yardsticks_of(known)
-    scale_of = dict(zip((spec.env_id for spec in known), scales, strict=True))
+    places = {run.environment: _place(run.environment, runs, options) for run in runs}
+    ranks = [sum(run[:2] == one[:2] for run in runs[:k]) for k, one in enumerate(runs)]
+    first = int(runs[0].seed) if runs[0].seed.isdigit() else 0
+    if any(run.seed != str(first + rank) for run, rank in zip(runs, ranks, strict=True)):
+        first = 0
+        notes.append("seeds are numbered from 0 for each agent")
     study = StudySpec(
         name=root.name,
         title=f"{', '.join(agents)} on {', '.join(places)}",
         agents=tuple(AgentSpec(agent, "") for agent in agents),
-        environments=tuple(EnvironmentSpec(one, specs[one].env_id) for one in places),
-        n_seeds=max(Counter(run[:2] for run in runs).values()),
+        environments=tuple(EnvironmentSpec(one, spec.env_id) for one, (spec, _) in places.items()),
+        n_seeds=max(ranks) + 1,
+        first_seed=first,
         metric=options.metric,
         margin=options.margin,
+        figures=options.figures,
         figure=words,
     )
     planned, rows, curves = list[PlannedRun](), list[dict[str, Any]](), list[Curve]()
-    for agent, place, _, log in runs:
-        seed = sum(run.labels == (agent, place) for run in planned)
-        run = PlannedRun(agent, place, seed, specs[place], Path(log.place))
-        of_run = _curves(run, log)
-        try:
-            row = _row(study, run, log, kind, scale_of.get(run.spec.env_id), of_run)
-        except (LookupError, TypeError, ValueError) as error:
-            raise UserError(f"{log.path} is damaged: {one_line(error)}") from error
-        labels = {"agent": agent, "environment": place, "env_id": run.spec.env_id}
-        rows.append({**labels, **row, "path": log.place})
+    for rank, (agent, place, _, log) in zip(ranks, runs, strict=True):
+        spec, scale = places[place]
+        run = PlannedRun(agent, place, first + rank, spec, Path(log.place))
+        line = log.evaluations.steps, log.evaluations.returns
+        of_run = [evaluation_curve(run, log.episodes, *line), training_curve(run, log.episodes)]
+        labels = {"agent": agent, "environment": place, "env_id": spec.env_id, "path": log.place}
+        recorded = _recorded(log, kind, scale)
+        rows.append({**summary_row(study, run, recorded, log.episodes, of_run[0]), **labels})
         planned.append(run)
-        curves += of_run.values()
+        curves += of_run
     _note_budgets(rows, notes)
-    hidden = HIDDEN_COLUMNS if any(row["full_optimum"] is not None for row in rows) else ()
-    table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *hidden])
+    hidden = any(row["full_optimum"] is not None for row in rows)
+    table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *(HIDDEN_COLUMNS if hidden else ())])
     return StudyResults(study, root, table, joined(curves), tuple(planned))
 
 
-def _spec(place: str, runs: Sequence[_Run], options: Options) -> TrainSpec:
-    """The environment of runs; its id is empty if it is not known here, or differs by run.
+def _place(
+    place: str, runs: Sequence[_Run], options: Options
+) -> tuple[TrainSpec, Yardstick | None]:
+    """The environment of runs and its scale; the id is empty if it is not known, or differs by run.
 
-    No log makes this import a module, except Gymnasium's and this project's.
+    A log imports no module: only Gymnasium's and this project's, and those imported before, count.
     """
-    unknown = TrainSpec(algo="", env_id="", gym_packages=[*options.gym_packages])
-    kwargs = [
-        dict(options.env_kwargs or run.log.env_kwargs) for run in runs if run.environment == place
-    ]
+    from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single
+    from rl_yardstick.pipeline.evaluation.sampled import bracketed_yardstick
+
+    here = [run.log for run in runs if run.environment == place]
+    kwargs = [dict(options.env_kwargs or log.env_kwargs) for log in here]
     for env_id in (place, place.replace("-", "/", 1)):
         entry = gym.registry[env_id].entry_point if env_id in gym.registry else None
-        module = entry.partition(":")[0] if isinstance(entry, str) else ""
+        module = entry.partition(":")[0] if isinstance(entry, str) else "rl_yardstick."
         is_trusted = module.startswith(("gymnasium.", "rl_yardstick.")) or module in sys.modules
-        if entry and (is_trusted or not module) and all(one == kwargs[0] for one in kwargs):
-            spec = unknown.changed(env_id=env_id, env_kwargs=kwargs[0])
+        if entry is not None and is_trusted and kwargs == kwargs[:1] * len(kwargs):
+            spec = validated({"algo": "", "env_id": env_id, "env_kwargs": kwargs[0]})
             with suppress(UserError, *MISTAKES):
-                make_single_env(spec).close()
-                return spec
-    return unknown
+                exact = evaluator_of_single(spec)
+                return spec, bracketed_yardstick(spec) if exact is None else exact.yardstick
+    return validated({"algo": "", "env_id": ""}), None
 
 
-def yardsticks_of(specs: Sequence[TrainSpec]) -> list[Yardstick | None]:
-    """The scale of each environment, if known; it loads PyTorch, unless there are none."""
-    found: list[Yardstick | None] = []
-    for spec in specs:
-        from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single
-        from rl_yardstick.pipeline.evaluation.sampled import bracketed_yardstick
-
-        found.append(None)
-        with suppress(UserError, *MISTAKES):
-            import_modules(spec.gym_packages)
-            exact = evaluator_of_single(spec)
-            found[-1] = bracketed_yardstick(spec) if exact is None else exact.yardstick
-    return found
-
-
-_NOTHING = Episodes(np.empty(0), np.empty(0), np.empty(0))
-
-
-def _curves(run: PlannedRun, log: Log) -> dict[str, Curve]:
-    """The learning curves of a run by kind; a column of a table counts as evaluations."""
-    found, episodes = dict[str, Curve](), log.lines.get(TRAINING, _NOTHING)
-    for name, line in log.lines.items():
-        if name == TRAINING:
-            found[name] = training_curve(run, line)
-        elif KINDS[0] not in found:
-            found[KINDS[0]] = logged_curve(run, episodes, line.steps, line.returns)
-    return found
-
-
-def _row(
-    study: StudySpec,
-    run: PlannedRun,
-    log: Log,
-    kind: str,
-    scale: Yardstick | None,
-    curves: Mapping[str, Curve],
-) -> dict[str, Any]:
-    """The row of a run in the summary."""
-    value, figures = log.figures[kind], {} if scale is None else scale.figures(log.figures[kind])
-    final = {"exact": False, **figures, **(log.recorded if kind == FINAL else {})}
-    curve = curves.get(KINDS[0]) or logged_curve(run, _NOTHING, np.empty(0), np.empty(0))
-    episodes = log.lines.get(TRAINING, _NOTHING)
-    ends = [line.steps[-1] for line in log.lines.values()]
-    recorded = {
+def _recorded(log: Log, kind: str, scale: Yardstick | None) -> dict[str, Any]:
+    """A run's figures as ``run.json`` has them."""
+    value, returns = log.figures[kind], log.evaluations.returns
+    own = log.recorded if kind == FINAL else {}
+    figures = {} if scale is None else scale.figures(value)
+    ends = [*log.evaluations.steps[-1:], *log.episodes.steps[-1:]]
+    return {
         **dict.fromkeys(OF_RUN),
-        "final": {**final, "mean_return": value},
-        "best_mean_return": max(curve["value"], default=None),
+        "final": {"mean_return": value, "exact": False, **figures, **own},
+        "best_mean_return": max(returns, default=None),
         "n_timesteps": max(ends, default=None),
     }
-    return summary_row(study, run, recorded, episodes, curve)
 
 
 def _note_budgets(rows: Sequence[Mapping[str, Any]], notes: list[str]) -> None:
     """Note where the runs of some agents are longer than those of others."""
     table = pd.DataFrame(rows).astype({"n_timesteps": float})
     for place, here in table.groupby("environment", sort=False):
-        steps = here.groupby("agent")["n_timesteps"].median().dropna()
-        if len(steps) > 1 and steps.max() > 1.1 * steps.min():
-            low, high = (
-                f"{steps[name]:,.0f} ({name})" for name in (steps.idxmin(), steps.idxmax())
-            )
+        steps = here.groupby("agent")["n_timesteps"].median().dropna().sort_values()
+        if len(steps) > 1 and steps.iloc[-1] > 1.1 * steps.iloc[0]:
+            low, *_, high = (f"{n:,.0f} ({agent})" for agent, n in steps.items())
             notes.append(f"{place}: budgets differ, from {low} to {high} steps")
 
 
@@ -294,31 +229,23 @@ class Judgement:
 
     @property
     def table(self) -> pd.DataFrame:
-        """A row for each agent on each environment, the best first: the mean and its interval."""
-        rows = [
-            {
-                "environment": one.environment,
-                "agent": agent.agent,
-                "runs": agent.n_runs,
-                **{end: getattr(agent.metric.mean, end) for end in ("point", "low", "high")},
-                "score": None if agent.score is None else agent.score.point,
-                "optimum": one.optimum,
-            }
-            for one in self.analysis.environments
-            for agent in one.agents
-        ]
-        found = pd.DataFrame(rows).rename(columns={"point": "mean"})
-        return found.dropna(axis="columns", how="all")
+        """A row for each agent on each environment, the best first."""
+        columns = ["environment", "agent", "runs", "mean", "low", "high", "score", "optimum"]
+        rows = []
+        for one in self.analysis.environments:
+            for agent in one.agents:
+                mean, score = agent.metric.mean, agent.score and agent.score.point
+                ends = mean.point, mean.low, mean.high
+                rows.append([one.environment, agent.agent, agent.n_runs, *ends, score, one.optimum])
+        return pd.DataFrame(rows, columns=columns).dropna(axis="columns", how="all")
 
     @property
     def verdicts(self) -> pd.DataFrame:
-        """A row for each pair of agents, the word on the first, and the difference of the means."""
-        pairs = [pair for one in self.analysis.environments for pair in one.pairs]
-        rows = [
-            {**asdict(p), "verdict": p.text, **dict(zip(("low", "high"), p.interval))}
-            for p in pairs
-        ]
+        """A row for each pair of agents: the word on the first, the difference of the means."""
         columns = ["environment", "first", "verdict", "second", "difference", "low", "high", "n"]
+        pairs = [pair for one in self.analysis.environments for pair in one.pairs]
+        ends = [{"verdict": p.text, "low": p.interval[0], "high": p.interval[1]} for p in pairs]
+        rows = [asdict(pair) | end for pair, end in zip(pairs, ends, strict=True)]
         return pd.DataFrame(rows, columns=columns)
 
     def _repr_html_(self) -> str:

@@ -109,19 +109,18 @@ TRAINING_POINTS = 100  # the most points of a run, and of a mean curve
 # Columns of `StudyResults.curves`. Each row is an evaluation, or the mean return of consecutive
 # training episodes at the end of the last one. ``kind`` is "evaluation" or "training".
 _LABELS = ("agent", "environment", "seed", "kind")
-KINDS = ("evaluation", "training")
 CURVE_COLUMNS = (*_LABELS, "step", "episode", "seconds", "value")
 
 Curve = dict[str, Any]  # of one run: labels, and the other columns, each of shape (n,)
 
 
-def logged_curve(
-    planned: PlannedRun, episodes: Episodes, steps: Floats, returns: Floats, kind: str = KINDS[0]
+def evaluation_curve(
+    planned: PlannedRun, episodes: Episodes, steps: Floats, returns: Floats
 ) -> Curve:
-    """Mean returns that were logged at these steps, such as evaluations during training."""
+    """Mean returns of the evaluations during training, at these steps."""
     begun = np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
     return {
-        **_labels(planned, kind),
+        **_labels(planned, "evaluation"),
         "step": steps,
         "episode": np.searchsorted(episodes.steps, steps, side="right").astype(np.float64),
         "seconds": np.interp(steps, *begun),
@@ -268,11 +267,8 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
             rows, curves = _batch_rows(planned, recorded), []
         else:
             episodes = read_episodes(planned.path)
-            evaluations = read_evaluations(planned.path)
-            curves = [
-                logged_curve(planned, episodes, *evaluations),
-                training_curve(planned, episodes),
-            ]
+            evaluations = evaluation_curve(planned, episodes, *read_evaluations(planned.path))
+            curves = [evaluations, training_curve(planned, episodes)]
             rows = [summary_row(study, planned, recorded, episodes, curves[0])]
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{planned.path / RECORD} is damaged: {error!r}") from error

@@ -17,7 +17,6 @@ from scipy import special
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.bandits import QUANTILES, PullStatistics
 from rl_yardstick.experiments.results import (
-    KINDS,
     StudyResults,
     curves_by_agent,
     mean_curve,
@@ -97,6 +96,7 @@ def numeric_sweeps(
     return found
 
 
+KINDS = ("evaluation", "training")
 AXES = ("step", "episode", "seconds")
 
 
