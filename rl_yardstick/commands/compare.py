@@ -56,13 +56,7 @@ def _margin(text: str) -> float:
 SEEDS = whole_number(1, 1_000_000)
 FLAGS: Flags = {
     "": (
-        flag(
-            "study",
-            "a study file, or the name of a shipped one; or folders and files with the logs of "
-            "finished runs",
-            nargs="*",
-            metavar="STUDY.yml|LOGS",
-        ),
+        flag("study", "a study (a file, or a shipped one), or logs of finished runs", nargs="*"),
         several("--env", "environments", "ID"),
         several("--algos", "agents (train --list has them)", "AGENT"),
         flag("--seeds", "how many seeds (default: the study's, or 10)", SEEDS),
@@ -97,24 +91,13 @@ FLAGS: Flags = {
         *shared("--diagnose", default=None),
         switch("--watch-learning", "pages that play how agents learn", dest="learning_pages"),
         flag("--figures", "formats (default: png svg)", nargs="+", choices=("png", "svg", "pdf")),
+        flag("--pattern", "labels in the paths of logs, e.g. '{agent}/{env}_{seed}'", default=""),
         switch("--no-report", "only tables: no figures and no page"),
     ),
-    "logs of finished runs, instead of a study": (
-        flag(
-            "--pattern",
-            "labels in paths, e.g. '{agent}/{env}_{seed}' (default: the first usual one that fits)",
-            default="",
-        ),
-        several("--columns", "a table's own names, e.g. agent=algo score=reward", "NAME=COLUMN"),
-    ),
     "off-policy evaluation, instead of a study": (
-        flag(
-            "--logged",
-            "judge trained agents on logged pulls; with --columns",
-            Path,
-            metavar="LOG.csv",
-        ),
+        flag("--logged", "judge trained agents on logged pulls", Path, metavar="LOG.csv"),
         several("--policy", "run folders or zips", "RUN", type=Path),
+        several("--columns", "a log's own names, e.g. arm=item_id reward=click", "NAME=COLUMN"),
     ),
 }
 
@@ -172,13 +155,9 @@ def main() -> int:
 
 def is_logs(words: Sequence[str]) -> bool:
     """Whether folders or files with logs are typed, and not a study."""
-    others = [
-        word
-        for word in words
-        if not (path := Path(word)).exists()
-        or path.suffix in (".yml", ".yaml")
-        or (path / "study.json").exists()
-    ]
+    paths = [Path(word) for word in words]
+    there = [path for path in paths if path.exists() and not (path / "study.json").exists()]
+    others = [path for path in paths if path not in there or path.suffix in (".yml", ".yaml")]
     if others and len(words) > 1:
         raise UserError(f"{others[0]} is no folder or file with logs: give one study, or logs")
     return bool(words) and not others

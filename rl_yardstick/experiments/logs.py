@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import importlib.util
 import io
-import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from rl_yardstick.experiments.results import LAST_EPISODES as LAST
-from rl_yardstick.experiments.results import MAX_TABLE, Episodes, evaluations_in, joined_episodes
+from rl_yardstick.experiments.results import MAX_TABLE, Episodes, joined_episodes, read_evaluations
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError, one_line, unknown
 from rl_yardstick.pipeline.files import read_bytes
@@ -155,11 +155,11 @@ def _read_folder(folder: Path, names: list[str], columns: Mapping[str, str], fou
             if name.endswith("monitor.csv"):
                 _add_monitor(log, path, found.notes)
             elif path.suffix == ".npz" and name not in _NO_LOGS:
-                log.add(EVALUATION, *evaluations_in(path))
+                log.add(EVALUATION, *read_evaluations(path))
             elif name == "progress.csv":
                 table = _read_table(path, found.notes)
-                step = _named_columns(table, {}, path).get("step")
-                _add_columns(log, table, step, returns_in(table.columns))
+                names_of = _named_columns(table, {}, path)
+                _add_columns(log, table, names_of.get("step"), returns_in(table.columns))
             elif path.suffix in (".csv", ".tsv") and name not in _NO_LOGS:
                 logs += table_logs(_read_table(path, found.notes), path, columns, found.notes)
             elif "tfevents" in name:
@@ -171,44 +171,42 @@ def _read_folder(folder: Path, names: list[str], columns: Mapping[str, str], fou
 
 # --- run folders ----------------------------------------------------------------------------------
 
+_TEXTS = ("acts_by", "measured_by")  # among final figures
 # Other files in run folders of this project.
 _NO_LOGS = ("diagnosis.csv", "value_maps.npz", "pulls.npz", "pull_statistics.npz")
 
 
 def _add_settings(log: Log, names: Sequence[str]) -> None:
     """Add what a run of this project or of rl_zoo3 has recorded of itself."""
+    saved: dict[str, Any] = {}
     for file in ("config.yml", "args.yml"):  # rl_zoo3 uses the latter before the former
         for path in log.path.glob(f"*/{file}"):
-            saved = read_saved(path)
-            log.env = saved["env"] if isinstance(saved.get("env"), str) else log.env
-            kwargs = saved.get("env_kwargs")
-            log.env_kwargs = kwargs if kwargs and isinstance(kwargs, dict) else log.env_kwargs
+            saved |= {key: value for key, value in read_saved(path).items() if value}
+    env, kwargs = saved.get("env"), saved.get("env_kwargs")
+    log.env, log.env_kwargs = str(env or ""), kwargs if isinstance(kwargs, dict) else {}
     final = Run(log.path).recorded().get("final") if RECORD in names else None
     if isinstance(final, dict) and isinstance(final.get("mean_return"), int | float):
-        texts = ("acts_by", "measured_by")
-        kinds = {name: str if name in texts else int | float for name in final}
+        kinds = {name: str if name in _TEXTS else int | float for name in final}
         log.recorded = {name: one for name, one in final.items() if isinstance(one, kinds[name])}
         log.figures[FINAL] = float(final["mean_return"])
 
 
 def _add_monitor(log: Log, path: Path, notes: list[str]) -> None:
     """Add the episodes in a file of Monitor; rows that are none are named and skipped."""
+    width, rows, faulty = 0, list[list[float]](), list[str]()
     text = read_bytes(path, MAX_TABLE).decode(errors="replace")
-    names, rows, faulty = list[str](), list[list[float]](), list[str]()
     for number, line in enumerate(text.splitlines(), start=1):
         cells = line.split(",")
-        if line.startswith("#"):
-            with suppress(ValueError, AttributeError, RecursionError):
-                log.env = log.env or str(json.loads(line[1:]).get("env_id") or "")
-        elif {"r", "l"} <= {*cells}:
-            names = cells
+        if line.startswith("#"):  # settings as JSON
+            log.env = log.env or "".join(re.findall(r'"env_id": *"([^"]+)"', line)[:1])
+        elif line.startswith("r,l"):
+            width = len(cells)
         elif line.strip():
-            names = names or ["r", "l", "t", *map(str, range(3, len(cells)))]
-            with suppress(ValueError, LookupError):
-                named = dict(zip(names, cells, strict=True))
-                row = [float(named[name]) for name in "rlt"]
-                if np.isfinite(row).all() and row[1] >= 1:
-                    rows.append(row)
+            width = width or len(cells)
+            with suppress(ValueError):
+                r, length, t = map(float, cells[:3])
+                if len(cells) == width and isfinite(r + t) and length >= 1:
+                    rows.append([r, length, t])
                     continue
             faulty.append(str(number))
     if faulty and not rows:
@@ -223,9 +221,8 @@ def _add_events(log: Log) -> None:
     """Add the returns in TensorBoard's event files, by tag."""
     if importlib.util.find_spec("tensorboard") is None:
         raise UserError(f"{log.path}: event files need: pip install 'rl-yardstick[tensorboard]'")
-    from tensorboard.backend.event_processing import event_accumulator
-
-    events = event_accumulator.EventAccumulator(str(log.path), {"scalars": 0})
+    module = "tensorboard.backend.event_processing.event_accumulator"
+    events = importlib.import_module(module).EventAccumulator(str(log.path), {"scalars": 0})
     try:
         events.Reload()
         for tag in returns_in(events.Tags()["scalars"]):
@@ -295,8 +292,8 @@ def table_logs(
         taken = "each row" if step is None else f"each part, to where {step!r} falls,"
         notes.append(f"{path} has no column of seeds: {taken} counts as a seed")
     logs = []
-    for values, rows in table.groupby([names[key] for key in given], sort=False):
-        texts = [re.sub(r"\.0$", "", str(value)) for value in values]
+    for of, rows in table.groupby([names[key] for key in given], sort=False):
+        texts = [re.sub(r"\.0$", "", str(value)) for value in of]
         log = Log(", ".join([str(path), *texts]), path, dict(zip(given, texts, strict=True)))
         _add_columns(log, rows, step, scores)
         logs.append(log)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import pandas as pd
@@ -22,7 +22,7 @@ from rl_yardstick.experiments.results import (
     HIDDEN_COLUMNS,
     OF_RUN,
     RUN_COLUMNS,
-    Curve,
+    RunResults,
     StudyResults,
     evaluation_curve,
     joined,
@@ -62,18 +62,8 @@ class Options:
 # --- agent, environment and seed ------------------------------------------------------------------
 
 
-class _Run(NamedTuple):
-    agent: str
-    environment: str
-    seed: str  # empty where none is told
-    log: Log
-
-
-def labels_in(place: str, pattern: str, forms: Mapping[str, str]) -> dict[str, str] | None:
-    """The labels at the end of a path, or None if the pattern, in which ``*`` is any text, fails.
-
-    ``forms`` has a regular expression for each label.
-    """
+def labels_in(place: str, pattern: str, forms: Mapping[str, str] = FORMS) -> dict[str, str]:
+    """The labels at the end of a path, empty where the pattern does not fit; ``*`` is any text."""
     text, *others = re.split(r"\{(\w*)\}", pattern)
     names, regex = others[::2], re.escape(text)
     if "agent" not in names or len({*names}) < len(names) or not {*names} <= {*forms}:
@@ -81,36 +71,36 @@ def labels_in(place: str, pattern: str, forms: Mapping[str, str]) -> dict[str, s
     for name, text in zip(names, others[1::2], strict=True):
         regex += f"(?P<{name}>{forms[name]}){re.escape(text)}"
     found = re.search("(?:^|/)" + regex.replace(r"\*", "[^/]*") + "$", place.replace("\\", "/"))
-    return None if found is None else found.groupdict()
+    return {} if found is None else found.groupdict()
 
 
-def _labelled(found: Found, options: Options) -> list[_Run]:
-    """The logs with their labels, in order, one for each agent, environment and seed."""
-    patterns = (options.pattern,) if options.pattern else PATTERNS
+def _labelled(found: Found, options: Options) -> list[Log]:
+    """The logs with all labels, in order, one for each agent, environment and seed."""
+    patterns = [options.pattern] if options.pattern else [*PATTERNS]
     forms = {**FORMS, "env": "[^/]+?"} if options.pattern else FORMS
-    used, runs = Counter[str](), dict[Any, _Run]()
+    used, runs = Counter[str](), dict[tuple[str, ...], Log]()
     for log in sorted(found.logs, key=lambda log: log.is_of_events):
-        labels = dict(log.labels)
-        if "agent" not in labels:
-            place = str(log.path.with_suffix("")) if labels else log.place
+        if "agent" not in log.labels:
+            place = str(log.path.with_suffix("")) if log.labels else log.place
             read = ((one, labels_in(place, one, forms)) for one in patterns)
-            pattern, in_path = next((pair for pair in read if pair[1]), ("", None))
-            if in_path is None:
+            pattern, in_path = next((pair for pair in read if pair[1]), ("", {}))
+            if not in_path:
                 raise UserError(f"--pattern {options.pattern} does not fit {place}")
-            labels = {**in_path, **labels}
+            log.labels = {**in_path, **log.labels}
             used[pattern] += 1
-        seed = re.sub(r"^\D+(?=\d+$)", "", labels.get("seed", ""))
-        run = _Run(labels["agent"], labels.get("env") or log.env or options.env, seed, log)
-        key = run[:3] if seed else (*run[:2], log.place)
+        seed = re.sub(r"^\D+(?=\d+$)", "", log.labels.get("seed", ""))
+        environment = log.labels.get("env") or log.env or options.env
+        log.labels = {"agent": log.labels["agent"], "env": environment, "seed": seed}
+        key = (*log.labels.values(), "" if seed else log.place)
         if key in runs and not log.is_of_events:
-            both = f"{runs[key].log.place} and {log.place}"
-            raise UserError(f"two runs are {', '.join(run[:3])}: {both}; --pattern splits them")
-        runs.setdefault(key, run)
+            both = f"{runs[key].place} and {log.place}"
+            raise UserError(f"two runs are {', '.join(key[:3])}: {both}; --pattern splits them")
+        runs.setdefault(key, log)
     for pattern, n in used.items():
         found.notes.append(f"labels of {n:,} from their paths, by --pattern '{pattern}'")
-    if n := sum(not run.seed for run in runs.values()):
+    if n := sum(not log.labels["seed"] for log in runs.values()):
         found.notes.append(f"{n:,} runs without a seed are numbered in their order")
-    return sorted(runs.values(), key=lambda run: (*run[:2], run.seed.zfill(20)))
+    return [runs[key] for key in sorted(runs, key=lambda key: (*key[:2], key[2].zfill(20)))]
 
 
 # --- from logs to a study -------------------------------------------------------------------------
@@ -123,21 +113,23 @@ def results_of(found: Found, options: Options, root: Path) -> StudyResults:
         UserError: if labels are missing, or are those of two runs.
     """
     every, notes = _labelled(found, options), found.notes
-    counts = Counter(kind for run in every for kind in run.log.figures)
+    counts = Counter(kind for log in every for kind in log.figures)
     kind = max([*WORDS, *counts], key=lambda kind: counts[kind])  # the first that most runs have
-    runs = [run for run in every if kind in run.log.figures]
-    is_last = any(len(run.log.evaluations.steps) for run in runs)
+    logs = [log for log in every if kind in log.figures]
+    is_last = any(len(log.evaluations.steps) for log in logs)
     words = WORDS.get(kind) or f"{'last ' if is_last else ''}{kind}"
     notes.append(f"figure of each run: {'mean ' if kind in WORDS else ''}{words}")
-    if n := len(every) - len(runs):
+    if n := len(every) - len(logs):
         notes.append(f"left out: {n:,} run{'s' * (n > 1)} without such a figure")
-    agents = list(dict.fromkeys(run.agent for run in runs))
+    labels = [(log.labels["agent"], log.labels["env"]) for log in logs]
+    agents = list(dict.fromkeys(agent for agent, _ in labels))
     if len(agents) == 1:
         notes.append(f"one agent only, {agents[0]}: a comparison needs two")
-    places = {run.environment: _place(run.environment, runs, options) for run in runs}
-    ranks = [sum(run[:2] == one[:2] for run in runs[:k]) for k, one in enumerate(runs)]
-    first = int(runs[0].seed) if runs[0].seed.isdigit() else 0
-    if any(run.seed != str(first + rank) for run, rank in zip(runs, ranks, strict=True)):
+    places = {env: _place(env, logs, options) for _, env in labels}
+    ranks = [labels[:k].count(one) for k, one in enumerate(labels)]
+    seeds = [log.labels["seed"] for log in logs]
+    first = int(seeds[0]) if seeds[0].isdigit() else 0
+    if seeds != [str(first + rank) for rank in ranks]:
         first = 0
         notes.append("seeds are numbered from 0 for each agent")
     study = StudySpec(
@@ -152,26 +144,23 @@ def results_of(found: Found, options: Options, root: Path) -> StudyResults:
         figures=options.figures,
         figure=words,
     )
-    planned, rows, curves = list[PlannedRun](), list[dict[str, Any]](), list[Curve]()
-    for rank, (agent, place, _, log) in zip(ranks, runs, strict=True):
-        spec, scale = places[place]
-        run = PlannedRun(agent, place, first + rank, spec, Path(log.place))
-        line = log.evaluations.steps, log.evaluations.returns
-        of_run = [evaluation_curve(run, log.episodes, *line), training_curve(run, log.episodes)]
-        labels = {"agent": agent, "environment": place, "env_id": spec.env_id, "path": log.place}
-        recorded = _recorded(log, kind, scale)
-        rows.append({**summary_row(study, run, recorded, log.episodes, of_run[0]), **labels})
-        planned.append(run)
-        curves += of_run
+    planned = [
+        PlannedRun(*of, first + rank, places[of[1]][0], Path(log.place))
+        for of, rank, log in zip(labels, ranks, logs, strict=True)
+    ]
+    scales = [places[run.environment][1] for run in planned]
+    runs = [
+        _read(study, run, log, kind, scale)
+        for run, log, scale in zip(planned, logs, scales, strict=True)
+    ]
+    rows, curves = [one.rows[0] for one in runs], [curve for one in runs for curve in one.curves]
     _note_budgets(rows, notes)
-    hidden = any(row["full_optimum"] is not None for row in rows)
-    table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *(HIDDEN_COLUMNS if hidden else ())])
+    hidden = HIDDEN_COLUMNS if any(row["full_optimum"] is not None for row in rows) else ()
+    table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *hidden])
     return StudyResults(study, root, table, joined(curves), tuple(planned))
 
 
-def _place(
-    place: str, runs: Sequence[_Run], options: Options
-) -> tuple[TrainSpec, Yardstick | None]:
+def _place(place: str, logs: Sequence[Log], options: Options) -> tuple[TrainSpec, Yardstick | None]:
     """The environment of runs and its scale; the id is empty if it is not known, or differs by run.
 
     A log imports no module: only Gymnasium's and this project's, and those imported before, count.
@@ -179,8 +168,8 @@ def _place(
     from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single
     from rl_yardstick.pipeline.evaluation.sampled import bracketed_yardstick
 
-    here = [run.log for run in runs if run.environment == place]
-    kwargs = [dict(options.env_kwargs or log.env_kwargs) for log in here]
+    given = options.env_kwargs
+    kwargs = [dict(given or log.env_kwargs) for log in logs if log.labels["env"] == place]
     for env_id in (place, place.replace("-", "/", 1)):
         entry = gym.registry[env_id].entry_point if env_id in gym.registry else None
         module = entry.partition(":")[0] if isinstance(entry, str) else "rl_yardstick."
@@ -193,18 +182,24 @@ def _place(
     return validated({"algo": "", "env_id": ""}), None
 
 
-def _recorded(log: Log, kind: str, scale: Yardstick | None) -> dict[str, Any]:
-    """A run's figures as ``run.json`` has them."""
-    value, returns = log.figures[kind], log.evaluations.returns
-    own = log.recorded if kind == FINAL else {}
+def _read(
+    study: StudySpec, run: PlannedRun, log: Log, kind: str, scale: Yardstick | None
+) -> RunResults:
+    """A run's row of the summary and its curves, as those of a run folder."""
+    evaluated, episodes, value = log.evaluations, log.episodes, log.figures[kind]
     figures = {} if scale is None else scale.figures(value)
-    ends = [*log.evaluations.steps[-1:], *log.episodes.steps[-1:]]
-    return {
+    own = log.recorded if kind == FINAL else {}
+    recorded = {
         **dict.fromkeys(OF_RUN),
         "final": {"mean_return": value, "exact": False, **figures, **own},
-        "best_mean_return": max(returns, default=None),
-        "n_timesteps": max(ends, default=None),
+        "best_mean_return": max(evaluated.returns, default=None),
+        "n_timesteps": max([*evaluated.steps[-1:], *episodes.steps[-1:]], default=None),
     }
+    curve = evaluation_curve(run, episodes, evaluated.steps, evaluated.returns)
+    row = summary_row(study, run, recorded, episodes, curve)
+    labels = {"agent": run.agent, "environment": run.environment, "path": log.place}
+    named = {**row, **labels, "env_id": run.spec.env_id}
+    return RunResults([named], [curve, training_curve(run, episodes)])
 
 
 def _note_budgets(rows: Sequence[Mapping[str, Any]], notes: list[str]) -> None:
@@ -229,24 +224,20 @@ class Judgement:
 
     @property
     def table(self) -> pd.DataFrame:
-        """A row for each agent on each environment, the best first."""
-        columns = ["environment", "agent", "runs", "mean", "low", "high", "score", "optimum"]
-        rows = []
-        for one in self.analysis.environments:
-            for agent in one.agents:
-                mean, score = agent.metric.mean, agent.score and agent.score.point
-                ends = mean.point, mean.low, mean.high
-                rows.append([one.environment, agent.agent, agent.n_runs, *ends, score, one.optimum])
-        return pd.DataFrame(rows, columns=columns).dropna(axis="columns", how="all")
+        """A row for each agent on each environment, the best first; ``n`` counts its runs."""
+        rows = [
+            {"environment": one.environment, "agent": agent.agent, **asdict(agent.metric.mean)}
+            | {"score": agent.score and agent.score.point, "optimum": one.optimum}
+            for one in self.analysis.environments
+            for agent in one.agents
+        ]
+        return pd.DataFrame(rows).rename(columns={"point": "mean"}).dropna(axis=1, how="all")
 
     @property
     def verdicts(self) -> pd.DataFrame:
-        """A row for each pair of agents: the word on the first, the difference of the means."""
-        columns = ["environment", "first", "verdict", "second", "difference", "low", "high", "n"]
+        """A row for each pair of agents, the word on the first, the difference of the means."""
         pairs = [pair for one in self.analysis.environments for pair in one.pairs]
-        ends = [{"verdict": p.text, "low": p.interval[0], "high": p.interval[1]} for p in pairs]
-        rows = [asdict(pair) | end for pair, end in zip(pairs, ends, strict=True)]
-        return pd.DataFrame(rows, columns=columns)
+        return pd.DataFrame([{"verdict": pair.text, **asdict(pair)} for pair in pairs])
 
     def _repr_html_(self) -> str:
         tables = [table.to_html(index=False, na_rep="") for table in (self.table, self.verdicts)]

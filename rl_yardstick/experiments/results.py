@@ -76,16 +76,10 @@ def _monitor_table(path: Path) -> Floats:
     return table[columns].to_numpy()
 
 
-def read_evaluations(folder: Path) -> tuple[Floats, Floats]:
-    """Read steps and mean returns of evaluations during training, each (n_evaluations,)."""
-    path = folder / "evaluations.npz"
+def read_evaluations(path: Path) -> tuple[Floats, Floats]:
+    """Read steps and mean returns in an ``evaluations.npz``, each (n,), if it exists."""
     if not path.exists():
         return np.empty(0), np.empty(0)
-    return evaluations_in(path)
-
-
-def evaluations_in(path: Path) -> tuple[Floats, Floats]:
-    """The same in a file with the arrays of Stable-Baselines3's EvalCallback."""
     arrays = read_arrays(path, {"timesteps": "n", "results": "n episodes"})
     return arrays["timesteps"].astype(np.float64), arrays["results"].mean(axis=1, dtype=np.float64)
 
@@ -267,7 +261,8 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
             rows, curves = _batch_rows(planned, recorded), []
         else:
             episodes = read_episodes(planned.path)
-            evaluations = evaluation_curve(planned, episodes, *read_evaluations(planned.path))
+            steps, returns = read_evaluations(planned.path / "evaluations.npz")
+            evaluations = evaluation_curve(planned, episodes, steps, returns)
             curves = [evaluations, training_curve(planned, episodes)]
             rows = [summary_row(study, planned, recorded, episodes, curves[0])]
     except (LookupError, TypeError, ValueError, AttributeError) as error:

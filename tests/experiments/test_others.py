@@ -12,7 +12,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
 from rl_yardstick.experiments.logs import find_logs
-from rl_yardstick.experiments.others import FORMS, PATTERNS, judge, labels_in
+from rl_yardstick.experiments.others import PATTERNS, judge, labels_in
 from rl_yardstick.pipeline.errors import UserError
 
 # The final figure of each run; sums and means of quarters are exact.
@@ -210,14 +210,14 @@ def test_scores_are_on_the_scale_where_the_environment_is_known():
     ],
 )
 def test_the_first_usual_pattern_that_fits(path, labels):
-    found = next(found for one in PATTERNS if (found := labels_in(path, one, FORMS)))
+    found = next(found for one in PATTERNS if (found := labels_in(path, one)))
     assert (found["agent"], found.get("env"), found.get("seed")) == labels
 
 
 def test_what_is_assumed_is_told(tmp_path):
     unseeded = curves("return").drop(columns="run")
     found = judge(unseeded)
-    assert found.table["runs"].tolist() == [6, 6]
+    assert found.table["n"].tolist() == [6, 6]
     assert "no column of seeds: each part, to where 'global_step' falls," in found.notes[0]
     assert "each row counts as a seed" in judge(table().drop(columns="seed")).notes[0]
     short = curves("return").query("algo == 'good' or global_step < 300")
