@@ -125,7 +125,7 @@ def results_of(found: Found, options: Options, root: Path) -> StudyResults:
     agents = list(dict.fromkeys(agent for agent, _ in labels))
     if len(agents) == 1:
         notes.append(f"one agent only, {agents[0]}: a comparison needs two")
-    places = {env: _place(env, logs, options) for _, env in labels}
+    places = {env: _place(env, logs, options) for env in dict.fromkeys(env for _, env in labels)}
     ranks = [labels[:k].count(one) for k, one in enumerate(labels)]
     seeds = [log.labels["seed"] for log in logs]
     first = int(seeds[0]) if seeds[0].isdigit() else 0
