@@ -1,6 +1,10 @@
 """Logs of runs that were done elsewhere, in the forms that other programs write them."""
 
 import json
+import re
+import shlex
+from functools import cache
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +18,9 @@ from stable_baselines3.common.monitor import Monitor
 from rl_yardstick.experiments.logs import find_logs
 from rl_yardstick.experiments.others import PATTERNS, judge, labels_in
 from rl_yardstick.pipeline.errors import UserError
+from tests.pipeline.short_runs import trained
+
+ROOT = Path(__file__).parents[2]
 
 # The final figure of each run; sums and means of quarters are exact.
 FIGURES = {
@@ -77,10 +84,14 @@ def damaged_monitor(folder, value):
 
 
 def evaluations(folder, value):
-    model = A2C("MlpPolicy", OneStep([0.0]), n_steps=4, device="cpu", seed=0)
     env = Monitor(OneStep([value - 1, value + 1]))
     log = EvalCallback(env, eval_freq=8, n_eval_episodes=2, log_path=str(folder), verbose=0)
-    model.learn(16, callback=log)
+    learner().learn(16, callback=log)
+
+
+@cache
+def learner():
+    return A2C("MlpPolicy", OneStep([0.0]), n_steps=4, device="cpu", seed=0)
 
 
 def progress(folder, value, kind="csv"):
@@ -276,6 +287,33 @@ def test_files_of_strangers_import_no_module(tmp_path, monkeypatch):
     folder = tmp_path / "ppo" / "Lake-v7_1"
     folder.mkdir(parents=True)
     old_monitor(folder, 3.0)
-    for final in ({"mean_return": "8"}, {"mean_return": 8.0, "optimum": "x"}, [1]):
+    wrong = {"mean_return": 8.0, "optimum": "x", "acts_by": [1]}
+    for final, mean in (({"mean_return": "8"}, 3.0), (wrong, 8.0), ([1], 3.0)):
         (folder / "run.json").write_text(json.dumps({"final": final}))
-        assert judge(tmp_path).table["mean"].tolist()[0] in (3.0, 8.0)
+        assert judge(tmp_path).table["mean"].tolist() == [mean]
+
+
+PAGE = (ROOT / "docs" / "other-runs.md").read_text()
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_the_commands_of_the_page(typed, own_folder):
+    """On runs of this project, whose final figures are those that they have recorded."""
+    runs = {name: trained(name, n_timesteps=300) for name in ("qlearning", "sarsa")}
+    finals = {name: outcome.final.mean_return for name, (_, outcome) in runs.items()}
+    table().to_csv("scores.csv")
+    for agent in ("ppo", "dqn"):
+        (own_folder / agent / "1").mkdir(parents=True)
+        monitor(own_folder / agent / "1" / "0", episodes(3.0))
+
+    for line in re.findall(r"^yardstick (.*?)(?: +#.*)?$", PAGE, re.MULTILINE):
+        code, out, err = typed("yardstick", *shlex.split(line), "-f", "studies", "--figures", "png")
+        assert (code, err) == (0, ""), f"{line}\n{out}{err}"
+    rows = pd.read_csv("studies/logs/summary.csv").set_index("agent")
+    assert rows["final"].to_dict() == finals
+    page = Path("studies/scores/report.html").read_text()
+    assert all(f'id="{part}"' in page for part in ("verdict", "ranking", "comparison"))
+    assert not any(f'id="{part}"' in page for part in ("films", "policies", "why"))
+    assert "--seeds cannot be given with logs" in typed("compare.py", "logs", "--seeds", 3)[2]
+    assert "--pattern and --columns belong to logs" in typed("compare.py", "--pattern", "x")[2]
+    assert "nowhere is no folder or file" in typed("compare.py", "logs", "nowhere")[2]
