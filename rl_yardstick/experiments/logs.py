@@ -85,13 +85,6 @@ class Log:
             elif kind == EVALUATION or not len(self.evaluations.steps):
                 self.evaluations = line
 
-    def add_monitors(self) -> None:
-        """Average Monitor's files over the environments of the run."""
-        if self.monitors:
-            means = [table[-LAST:, 0].mean() for table in self.monitors]
-            self.figures[TRAINING] = float(np.mean(means))
-            self.episodes = joined_episodes(self.monitors)
-
 
 @dataclass
 class Found:
@@ -143,14 +136,13 @@ def _read_folder(folder: Path, names: list[str], columns: Mapping[str, str], fou
     """Read the logs among these files of a folder, each of which may be damaged."""
     of_run = list(filter(_OF_RUN.fullmatch, names))
     run = Log(str(folder.resolve()), folder, is_of_events=all("tfevents" in n for n in of_run))
-    logs = [run]
+    logs = [run] if of_run else []
     with found.noting():
-        if of_run:
-            _add_settings(run, names)
+        _add_settings(run, of_run)
     for name in sorted(names):
         path, start = folder / name, re.sub(r"[._-]?(monitor\.csv|npz)$", "", name)
         log = run if name in of_run else Log(f"{run.place}/{start}", path)
-        logs.append(log)
+        logs += [] if name in of_run else [log]
         with found.noting():
             if name.endswith("monitor.csv"):
                 _add_monitor(log, path, found.notes)
@@ -158,15 +150,13 @@ def _read_folder(folder: Path, names: list[str], columns: Mapping[str, str], fou
                 log.add(EVALUATION, *read_evaluations(path))
             elif name == "progress.csv":
                 table = _read_table(path, found.notes)
-                names_of = _named_columns(table, {}, path)
-                _add_columns(log, table, names_of.get("step"), returns_in(table.columns))
+                step = _named_columns(table, {}, path).get("step")
+                _add_columns(log, table, step, returns_in(table.columns))
             elif path.suffix in (".csv", ".tsv") and name not in _NO_LOGS:
                 logs += table_logs(_read_table(path, found.notes), path, columns, found.notes)
             elif "tfevents" in name:
                 _add_events(log)
-    for log in {id(log): log for log in logs}.values():
-        log.add_monitors()
-        found.logs += [log] if log.figures else []
+    found.logs += [log for log in logs if log.figures]
 
 
 # --- run folders ----------------------------------------------------------------------------------
@@ -180,7 +170,7 @@ def _add_settings(log: Log, names: Sequence[str]) -> None:
     """Add what a run of this project or of rl_zoo3 has recorded of itself."""
     saved: dict[str, Any] = {}
     for file in ("config.yml", "args.yml"):  # rl_zoo3 uses the latter before the former
-        for path in log.path.glob(f"*/{file}"):
+        for path in log.path.glob(f"*/{file}") if names else ():
             saved |= {key: value for key, value in read_saved(path).items() if value}
     env, kwargs = saved.get("env"), saved.get("env_kwargs")
     log.env, log.env_kwargs = str(env or ""), kwargs if isinstance(kwargs, dict) else {}
@@ -215,6 +205,9 @@ def _add_monitor(log: Log, path: Path, notes: list[str]) -> None:
         which = f"line{'s' * (n > 1)} {', '.join(faulty[:5])}{', ...' * (n > 5)}"
         notes.append(f"{path}: skipped {n:,} of {n + len(rows):,} rows, no episodes: {which}")
     log.monitors += [np.array(rows)] if rows else []
+    if log.monitors:  # the mean over the environments of the run
+        log.figures[TRAINING] = float(np.mean([one[-LAST:, 0].mean() for one in log.monitors]))
+        log.episodes = joined_episodes(log.monitors)
 
 
 def _add_events(log: Log) -> None:
