@@ -177,7 +177,8 @@ def _add_settings(log: Log, names: Sequence[str]) -> None:
     final = Run(log.path).recorded().get("final") if RECORD in names else None
     if isinstance(final, dict) and isinstance(final.get("mean_return"), int | float):
         kinds = {name: str if name in _TEXTS else int | float for name in final}
-        log.recorded = {name: one for name, one in final.items() if isinstance(one, kinds[name])}
+        kept = {name: one for name, one in final.items() if isinstance(one, kinds[name])}
+        log.recorded = kept if "baseline" in kept else {}  # else it is on no scale
         log.figures[FINAL] = float(final["mean_return"])
 
 

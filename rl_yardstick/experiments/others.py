@@ -168,18 +168,18 @@ def _place(place: str, logs: Sequence[Log], options: Options) -> tuple[TrainSpec
     from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single
     from rl_yardstick.pipeline.evaluation.sampled import bracketed_yardstick
 
-    given = options.env_kwargs
+    given, unknown = options.env_kwargs, validated({"algo": "", "env_id": "", "n_timesteps": 1})
     kwargs = [dict(given or log.env_kwargs) for log in logs if log.labels["env"] == place]
     for env_id in (place, place.replace("-", "/", 1)):
         entry = gym.registry[env_id].entry_point if env_id in gym.registry else None
         module = entry.partition(":")[0] if isinstance(entry, str) else "rl_yardstick."
         is_trusted = module.startswith(("gymnasium.", "rl_yardstick.")) or module in sys.modules
         if entry is not None and is_trusted and kwargs == kwargs[:1] * len(kwargs):
-            spec = validated({"algo": "", "env_id": env_id, "env_kwargs": kwargs[0]})
+            spec = unknown.changed(env_id=env_id, env_kwargs=kwargs[0])
             with suppress(UserError, *MISTAKES):
                 exact = evaluator_of_single(spec)
                 return spec, bracketed_yardstick(spec) if exact is None else exact.yardstick
-    return validated({"algo": "", "env_id": ""}), None
+    return unknown, None
 
 
 def _read(

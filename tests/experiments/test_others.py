@@ -18,6 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 from rl_yardstick.experiments.logs import find_logs
 from rl_yardstick.experiments.others import PATTERNS, judge, labels_in
 from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.report.series import learning_curves
 from tests.pipeline.short_runs import trained
 
 ROOT = Path(__file__).parents[2]
@@ -116,7 +117,10 @@ def test_run_folders_are_judged_as_their_numbers_are(tmp_path, write):
         folder = tmp_path / agent / f"Lake-v7_{seed}"
         folder.mkdir(parents=True)
         write(folder, value)
-    check(judge(tmp_path), "last evaluation" if write is evaluations else "last 100 training")
+    found = judge(tmp_path)
+    curves = learning_curves(found.analysis.results, found.analysis.environments[0])
+    assert {one.budget for one in curves.values()} == {"step"}
+    check(found, "last evaluation" if write is evaluations else "last 100 training")
 
 
 def check(found, words):
@@ -276,8 +280,8 @@ def test_files_of_strangers_import_no_module(tmp_path, monkeypatch):
     folder = tmp_path / "ppo" / "Lake-v7_1"
     folder.mkdir(parents=True)
     old_monitor(folder, 3.0)
-    wrong = {"mean_return": 8.0, "optimum": "x", "acts_by": [1]}
-    for final, mean in (({"mean_return": "8"}, 3.0), (wrong, 8.0), ([1], 3.0)):
+    wrong, half = {"mean_return": 8.0, "optimum": "x"}, {"mean_return": 8.0, "optimum": 9.0}
+    for final, mean in (({"mean_return": "8"}, 3.0), (wrong, 8.0), (half, 8.0), ([1], 3.0)):
         (folder / "run.json").write_text(json.dumps({"final": final}))
         assert judge(tmp_path).table["mean"].tolist() == [mean]
 
