@@ -284,15 +284,17 @@ def import_typed(args: argparse.Namespace) -> None:
     import_modules(args.gym_packages)
 
 
-def check_alone(parser: OneLineParser, beside: Collection[str]) -> None:
-    """Refuse what is typed beside ``--resume``, but for the flags whose ``dest`` is given."""
+def check_alone(
+    parser: OneLineParser, beside: Collection[str], what: str = "--resume: the run has its own"
+) -> None:
+    """Refuse what is typed beside ``--resume`` or logs, but for flags whose ``dest`` is given."""
     for action in parser._actions:
         action.default = argparse.SUPPRESS  # only typed flags remain, also typed defaults
     typed = vars(parser.parse_args())
     for action in parser._actions:
         if action.dest in typed and action.dest not in beside:
             name = next(reversed(action.option_strings), action.dest)
-            raise UserError(f"{name} cannot be given with --resume: the run has its own")
+            raise UserError(f"{name} cannot be given with {what}")
 
 
 # --- checks of values -----------------------------------------------------------------------------

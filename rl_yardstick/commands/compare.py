@@ -39,6 +39,7 @@ examples:
   python compare.py --env FrozenLake-v1 --algos qlearning sarsa dqn ppo --seeds 10
   python compare.py studies/warehouse-learning-rate.yml --until-decided
   python compare.py --resume logs/studies/warehouse-learning-rate
+  python compare.py logs/ppo logs/dqn  # runs that were done elsewhere, by their logs
   python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
 
 The same command again does the missing runs, and no others.
@@ -55,7 +56,7 @@ def _margin(text: str) -> float:
 SEEDS = whole_number(1, 1_000_000)
 FLAGS: Flags = {
     "": (
-        flag("study", "a study file, or the name of a shipped one", nargs="?", metavar="STUDY.yml"),
+        flag("study", "a study (a file, or a shipped one), or logs of finished runs", nargs="*"),
         several("--env", "environments", "ID"),
         several("--algos", "agents (train --list has them)", "AGENT"),
         flag("--seeds", "how many seeds (default: the study's, or 10)", SEEDS),
@@ -90,12 +91,13 @@ FLAGS: Flags = {
         *shared("--diagnose", default=None),
         switch("--watch-learning", "pages that play how agents learn", dest="learning_pages"),
         flag("--figures", "formats (default: png svg)", nargs="+", choices=("png", "svg", "pdf")),
+        flag("--pattern", "labels in the paths of logs, e.g. '{agent}/{env}_{seed}'", default=""),
         switch("--no-report", "only tables: no figures and no page"),
     ),
     "off-policy evaluation, instead of a study": (
         flag("--logged", "judge trained agents on logged pulls", Path, metavar="LOG.csv"),
         several("--policy", "run folders or zips", "RUN", type=Path),
-        several("--columns", "the log's own names, e.g. arm=item_id reward=click", "NAME=COLUMN"),
+        several("--columns", "a log's own names, e.g. arm=item_id reward=click", "NAME=COLUMN"),
     ),
 }
 
@@ -119,6 +121,14 @@ def main() -> int:
     cli.import_typed(args)
     if args.logged or args.policy:
         return compare_on_log(args)
+    from rl_yardstick.experiments.study import METRICS
+
+    if args.metric is not None and args.metric not in METRICS:
+        raise unknown("--metric: unknown metric", args.metric, METRICS)
+    if is_logs(args.study):
+        return judge_logs(args, stop)
+    if args.pattern or args.columns:
+        raise UserError("--pattern and --columns belong to logs: name their folders or files")
     from rl_yardstick.commands.terminal import table_console
     from rl_yardstick.experiments.plan import StudyRecord, specs_of
 
@@ -141,6 +151,48 @@ def main() -> int:
             looks = plan_of_looks(record.study, root, args.max_seeds)
             record = replace(record, looks=looks)
         return carry_out(job, record)
+
+
+def is_logs(words: Sequence[str]) -> bool:
+    """Whether folders or files with logs are typed, and not a study."""
+    paths = [Path(word) for word in words]
+    there = [path for path in paths if path.exists() and not (path / "study.json").exists()]
+    others = [path for path in paths if path not in there or path.suffix in (".yml", ".yaml")]
+    if others and len(words) > 1:
+        raise UserError(f"{others[0]} is no folder or file with logs: give one study, or logs")
+    return bool(words) and not others
+
+
+def judge_logs(args: argparse.Namespace, stop: Stop) -> int:
+    """Judge finished runs by their logs, write tables and page; return the exit code."""
+    cli.check_alone(build_parser(), _BESIDE_LOGS, "logs: their runs are finished")
+    if len(args.env or ()) > 1:
+        raise UserError("--env names the environment of logs that name none: give one")
+    from rl_yardstick.commands.terminal import table_console
+    from rl_yardstick.experiments.logs import find_logs
+    from rl_yardstick.experiments.others import Options, results_of
+    from rl_yardstick.experiments.study import file_name
+    from rl_yardstick.pipeline.settings import parse_assignments
+
+    columns = dict(word.partition("=")[::2] for word in args.columns)
+    kwargs = parse_assignments(args.env_kwargs, "--env-kwargs")
+    env, metric = (args.env or [Options.env])[0], args.metric or Options.metric
+    figures = tuple(args.figures or Options.figures)
+    options = Options(args.pattern, columns, env, kwargs, metric, args.margin, figures)
+    console, paths = table_console(), [Path(word) for word in args.study]
+    root = Path(args.log_folder) / (args.name or file_name(paths[0].absolute().stem))
+    if (root / "study.json").exists():
+        raise UserError(f"{root} is a study's folder: give another one by --name NAME")
+    with console.status("reading the logs"):
+        found = find_logs(paths, columns)
+        results = results_of(found, options, root)
+    for line in (results.study.title, *found.notes):
+        console.print(line)
+    workers = workers_of(args, root, None)
+    with held(root), workers:
+        job = Job(root, cli.command_line(), console, stop, workers, not args.no_report)
+        _judge(job, results, ())
+    return 0
 
 
 @dataclass(frozen=True)
@@ -341,7 +393,7 @@ def _draw(job: Job, analysis: StudyAnalysis) -> list[Path]:
     """Draw the figures and write the page, unless nothing is new; return the files."""
     from rl_yardstick.report.page import current_files, write_report
 
-    if files := current_files(analysis.results, job.command):
+    if analysis.results.finished and (files := current_files(analysis.results, job.command)):
         return files
     from rl_yardstick.report.figures import write_figures
     from rl_yardstick.report.page.frame import Report
@@ -365,13 +417,16 @@ def _draw(job: Job, analysis: StudyAnalysis) -> list[Path]:
 
 # --- from flags to a study ------------------------------------------------------------------------
 
+_BESIDE_LOGS = {
+    *("study", "pattern", "columns", "env", "env_kwargs", "gym_packages", "metric", "margin"),
+    *("name", "log_folder", "figures", "no_report", "jobs"),
+}
 _BESIDE_RESUME = {"resume", "gym_packages", "jobs", "cluster", "no_report", "log_folder"}
 
 
 def study_spec(args: argparse.Namespace) -> StudySpec:
     """The study that the arguments select, with their changes."""
     from rl_yardstick.experiments.study import (
-        METRICS,
         StudySpec,
         find_study,
         read_study,
@@ -384,15 +439,13 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
         raise UserError("--until-decided and --quick do not go together: give one of them")
     if args.learning_pages and args.no_report:
         raise UserError("--watch-learning is a section of the page: leave out --no-report")
-    if args.metric is not None and args.metric not in METRICS:
-        raise unknown("--metric: unknown metric", args.metric, METRICS)
     cli.check_tensorboard(args.tensorboard)
     if not args.study:
         study = _study_of_flags(args)
     elif args.env or args.algos:
         raise UserError("give a study file, or --env and --algos, not both")
     else:
-        study = read_study(find_study(args.study))
+        study = read_study(find_study(args.study[0]))
     # A flag with the name of a field sets that field, if it is given.
     named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
     changes = {**named, "n_seeds": args.seeds, "gym_packages": tuple(args.gym_packages)}

@@ -95,7 +95,8 @@ def _evidence_on(results: StudyResults, environment: str) -> Evidence:
             margin = MARGIN if study.margin is None else study.margin / (optimum - baseline)
     # Agents that do not learn are certain if policies are evaluated exactly.
     is_exact = (table["exact"] == True).all()  # noqa: E712  # None is neither True nor False
-    fixed = [a.label for a in study.agents if ALGORITHMS[a.algo].family in FIXED_POLICIES]
+    families = {a.label: ALGORITHMS[a.algo].family for a in study.agents if a.algo}
+    fixed = [name for name, family in families.items() if family in FIXED_POLICIES]
     seeds = dict.fromkeys((agent.label for agent in study.agents), 0)
     for run in results.planned:
         if run.environment == environment:
@@ -122,6 +123,8 @@ def _bounds(results: StudyResults, environment: str, optimum: float | None) -> B
     if study.metric in COSTS:
         return 0.0, np.inf
     first = {run.agent: run for run in results.planned if run.environment == environment}
+    if not next(iter(first.values())).spec.env_id:
+        return UNBOUNDED  # an environment of somebody else's runs that is not known here
     if study.metric in OF_TRAINING and any(training_changes(r.spec) for r in first.values()):
         return UNBOUNDED  # returns of training on a changed environment
     with closing(make_single_env(next(iter(first.values())).spec)) as env:
@@ -392,7 +395,8 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
     if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
         score = mean_over_runs(np.clip(values("score"), 0, 1), UNIT)
     of_returns = evidence.bounds if study.metric in ON_THE_SCALE else UNBOUNDED
-    first = next(run for run in results.planned if run.labels == (agent, environment))
+    specs = {run.labels: run.spec for run in results.planned if run.spec.env_id}
+    spec = specs.get((agent, environment))
     return AgentAnalysis(
         agent=agent,
         runs=runs,
@@ -410,7 +414,7 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         episodes_to_stay=steps("episodes_to_stay"),
         success_rate=known("success_rate", UNIT),
         seconds=mean("cpu_seconds", (0.0, np.inf)),
-        changes=training_changes(first.spec),
+        changes=() if spec is None else training_changes(spec),
         stochastic=known("stochastic_return"),
         acts_by=_only(table["acts_by"]),
         discounted=known("discounted_return"),

@@ -51,9 +51,13 @@ def read_episodes(folder: Path) -> Episodes:
     paths = sorted(folder.glob("*.monitor.csv"))
     if not paths:
         raise UserError(f"{folder} has no 0.monitor.csv")
-    tables = [_monitor_table(path) for path in paths]
+    return joined_episodes([_monitor_table(path) for path in paths])
+
+
+def joined_episodes(tables: Sequence[Floats]) -> Episodes:
+    """The episodes of all environments of a run: for each return, length, time, shape (n, 3)."""
     # The environments step together, so all have done the same number of steps.
-    steps = np.concatenate([len(paths) * table[:, 1].cumsum() for table in tables])
+    steps = np.concatenate([len(tables) * table[:, 1].cumsum() for table in tables])
     order = np.argsort(steps, kind="stable")
     rows = np.concatenate(tables)[order]
     # Episodes that end in one step are written a moment after each other, in no fixed order.
@@ -72,9 +76,8 @@ def _monitor_table(path: Path) -> Floats:
     return table[columns].to_numpy()
 
 
-def read_evaluations(folder: Path) -> tuple[Floats, Floats]:
-    """Read steps and mean returns of evaluations during training, each (n_evaluations,)."""
-    path = folder / "evaluations.npz"
+def read_evaluations(path: Path) -> tuple[Floats, Floats]:
+    """Read steps and mean returns in an ``evaluations.npz``, each (n,), if it exists."""
     if not path.exists():
         return np.empty(0), np.empty(0)
     arrays = read_arrays(path, {"timesteps": "n", "results": "n episodes"})
@@ -105,9 +108,10 @@ CURVE_COLUMNS = (*_LABELS, "step", "episode", "seconds", "value")
 Curve = dict[str, Any]  # of one run: labels, and the other columns, each of shape (n,)
 
 
-def evaluation_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
-    """Mean returns of the evaluations during training."""
-    steps, returns = read_evaluations(planned.path)
+def evaluation_curve(
+    planned: PlannedRun, episodes: Episodes, steps: Floats, returns: Floats
+) -> Curve:
+    """Mean returns of the evaluations during training, at these steps."""
     begun = np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
     return {
         **_labels(planned, "evaluation"),
@@ -195,7 +199,7 @@ _OF_FINAL = (
     *("gap", "score", "acts_by", "stochastic_return", "discount", "discounted_return"),
     "discounted_optimum",
 )
-_OF_RUN = ("best_timesteps", "n_timesteps", "seconds", "cpu_seconds", "engine")
+OF_RUN = ("best_timesteps", "n_timesteps", "seconds", "cpu_seconds", "engine")
 # Columns of `StudyResults.summary`, explained in docs/compare.md; returns are undiscounted sums.
 RUN_COLUMNS = (
     *("agent", "algo", "environment", "env_id", "seed"),
@@ -257,8 +261,10 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
             rows, curves = _batch_rows(planned, recorded), []
         else:
             episodes = read_episodes(planned.path)
-            curves = [evaluation_curve(planned, episodes), training_curve(planned, episodes)]
-            rows = [_summary_row(study, planned, recorded, episodes, curves[0])]
+            steps, returns = read_evaluations(planned.path / "evaluations.npz")
+            evaluations = evaluation_curve(planned, episodes, steps, returns)
+            curves = [evaluations, training_curve(planned, episodes)]
+            rows = [summary_row(study, planned, recorded, episodes, curves[0])]
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{planned.path / RECORD} is damaged: {error!r}") from error
     spec, path = planned.spec, str(planned.path)
@@ -284,13 +290,14 @@ def _batch_rows(planned: PlannedRun, recorded: Mapping[str, Any]) -> list[dict[s
     ]
 
 
-def _summary_row(
+def summary_row(
     study: StudySpec,
     planned: PlannedRun,
     recorded: Mapping[str, Any],
     episodes: Episodes,
     evaluations: Curve,
 ) -> dict[str, Any]:
+    """The row of a run in the summary, from its record, episodes and evaluations."""
     final = recorded["final"] or {}
     final = with_memory(final) if planned.on_memory_scale else final
     steps, values = evaluations["step"], evaluations["value"]
@@ -308,7 +315,7 @@ def _summary_row(
         "regret": run_regret(planned),
         **speed_figures(study, planned.spec.env_id, final, evaluations),
         "n_episodes": len(episodes.returns),
-        **{name: recorded[name] for name in _OF_RUN},
+        **{name: recorded[name] for name in OF_RUN},
     }
 
 
@@ -327,7 +334,7 @@ def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float 
     # It is unknown whether any policy reaches an upper bound of the optimum.
     reachable = final.get("optimum_at_least", final.get("optimum"))
     if "optimum_at_least" in final or reachable is None:
-        registered = gym.spec(env_id).reward_threshold
+        registered = gym.spec(env_id).reward_threshold if env_id else None
         if registered is not None:
             return float(registered)
     if reachable is None:

@@ -153,11 +153,17 @@ class StudySpec:
     run_timeout: float | None = None  #: seconds that each run may take; None for no limit
     first_seed: int = 0  #: the first seed; the others follow it
     against: str = ""  #: label of the only agent to compare the others with; empty for all pairs
+    figure: str = ""  #: the final figure of runs that were done elsewhere, in words
 
     @property
     def seeds(self) -> range:
         """The seeds."""
         return range(self.first_seed, self.first_seed + self.n_seeds)
+
+    @property
+    def metric_words(self) -> str:
+        """The metric of the verdicts, in words."""
+        return (self.metric == "final" and self.figure) or METRIC_WORDS[self.metric]
 
     def quickened(self) -> StudySpec:
         """The study with few seeds and a small budget, in a separate folder."""

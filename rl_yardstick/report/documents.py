@@ -17,7 +17,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.results import StudyResults
-from rl_yardstick.experiments.study import METRIC_WORDS
 from rl_yardstick.pipeline.errors import visible
 from rl_yardstick.pipeline.files import replacing, write_json, write_text
 from rl_yardstick.report import words
@@ -186,7 +185,7 @@ def headline(analysis: StudyAnalysis) -> Table:
 
 def _legend(analysis: StudyAnalysis) -> str:
     study, environments = analysis.study, analysis.environments
-    what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
+    what = f"{study.metric_words.capitalize()}: the mean; scores where they are known."
     if all(one.is_score for one in environments):
         what = "Mean score: 1 is the optimum, 0 the best random or constant policy, and less "
         what += "counts as 0."
@@ -243,7 +242,7 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
     table = pd.DataFrame.from_dict(found, orient="index")
     kept = table.loc[:, (table != NOTHING).any()]
     rows = [Row(*of, list(map(Cell, cells))) for of, cells in zip(found, kept.values, strict=True)]
-    metric = METRIC_WORDS[results.study.metric]
+    metric = results.study.metric_words
     caption = f"{environment.environment}: {metric}, with 95 % intervals over seeds."
     return Table(["", *kept], rows, caption)
 

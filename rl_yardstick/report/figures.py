@@ -26,7 +26,7 @@ from matplotlib.ticker import (
 from matplotlib.transforms import offset_copy
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis
-from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, file_name
+from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, StudySpec, file_name
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.files import replacing
 from rl_yardstick.report.series import (
@@ -414,7 +414,7 @@ def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
             axes.axhline(height, color=REFERENCE, ls=style, lw=1, label=label, zorder=1)
 
 
-def draw_runs(axes: Axes, one: EnvironmentSeries, metric: str, marks: Marks) -> None:
+def draw_runs(axes: Axes, one: EnvironmentSeries, study: StudySpec, marks: Marks) -> None:
     """Each run as a dot, the mean with its interval; the best agent on top."""
     runs, environment = one.runs, one.environment
     upwards = runs[::-1]
@@ -431,7 +431,7 @@ def draw_runs(axes: Axes, one: EnvironmentSeries, metric: str, marks: Marks) -> 
     lines = max(name.count("\n") + 1 for name in names)
     _figure_of(axes).set_figheight(1.1 + len(names) * max(0.32, _LINE * lines + 0.04))
     title = environment.environment
-    if metric in ("final", "best") and environment.optimum is not None:
+    if study.metric in ("final", "best") and environment.optimum is not None:
         at_least = environment.optimum_at_least
         for end in (environment.optimum, at_least):
             if end is not None:
@@ -439,7 +439,7 @@ def draw_runs(axes: Axes, one: EnvironmentSeries, metric: str, marks: Marks) -> 
         title += "; the line is the optimum" if at_least is None else _BETWEEN
         title += "" if environment.optimum_is_proven else " (the upper one is not proven)"
     ends = "range" if all(a.mean.is_range for a in runs) else "95 % interval"
-    x = f"{METRIC_WORDS[metric]}; mean, {ends}, each seed"
+    x = f"{study.metric_words}; mean, {ends}, each seed"
     x += "; diamond: all runs are equal" if any(a.mean.low == a.mean.high for a in runs) else ""
     title += f"; best: {environment.best}" if len(runs) > 1 else ""
     widest = max(width_of(line) for name in names for line in name.split("\n"))
@@ -586,7 +586,7 @@ def _study_figures(files: FigureFiles, series: StudySeries, one: EnvironmentSeri
         with files.figure(f"{name}_learning_curves", n_columns) as places:
             draw_learning_curves(places, one, marks)
     with files.figure(f"{name}_intervals") as (axes,):
-        draw_runs(axes, one, metric, marks)
+        draw_runs(axes, one, series.analysis.study, marks)
 
 
 def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Marks) -> None:

@@ -152,7 +152,9 @@ def _seconds(row: Row) -> Cell | None:
     return replace(estimate_cell(seconds), in_line=f"{number(seconds.point)} s")
 
 
-def _training(row: Row) -> Cell:
+def _training(row: Row) -> Cell | None:
+    if math.isnan(row.agent.last_episodes.point):
+        return None
     cell = estimate_cell(row.agent.last_episodes)
     return replace(cell, in_line=f"{cell.in_line} *") if row.agent.on_variant else cell
 

@@ -16,7 +16,7 @@ from rich.table import Table
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.off_policy import difference_in_value, mean_reward
 from rl_yardstick.experiments.plan import tuning_seeds
-from rl_yardstick.experiments.study import METRIC_WORDS, StudySpec
+from rl_yardstick.experiments.study import StudySpec
 from rl_yardstick.report.ranking import (
     BANDIT_COLUMNS,
     CAPTIONS,
@@ -217,7 +217,7 @@ def _caption(study: StudySpec, one: EnvironmentAnalysis, left_out: Sequence[str]
     over = seeds(*(one.seeds.values() or [study.n_seeds]))
     n_runs = [agent.n_runs for agent in one.agents]
     what = "the range of the runs" if max(n_runs, default=0) < FEW else "95 % intervals"
-    told = [f"mean: {METRIC_WORDS[study.metric]} over {over}, with {what}"]
+    told = [f"mean: {study.metric_words} over {over}, with {what}"]
     if any(agent.metric.mean.low == agent.metric.mean.high for agent in one.agents):
         told[0] += " (none where all runs are equal)"
     shown = [column.terminal for column, _ in filled(COLUMNS, rows)]

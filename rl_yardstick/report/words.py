@@ -15,7 +15,7 @@ import numpy as np
 
 from rl_yardstick.experiments.analysis import MARK, ON_THE_SCALE, EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.plan import Seeds, TuningSeeds
-from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
+from rl_yardstick.experiments.study import COSTS, OF_TRAINING, StudySpec
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import bracket_mark
@@ -311,7 +311,7 @@ def _standing(analysis: StudyAnalysis) -> Iterator[str]:
     best = [name for name in order if firsts[name] == max(firsts.values())]
     has, each = ("has", "") if len(best) == 1 else ("have", " each")
     over = seeds(*(agent.runs.n for one in learnt for agent in one.agents))
-    what, first = METRIC_WORDS[study.metric].removeprefix("mean "), learnt[0].agents[0]
+    what, first = study.metric_words.removeprefix("mean "), learnt[0].agents[0]
     where = f": {number(first.metric.mean.point)}"
     if all(one.is_score for one in learnt):
         what, where = "score", f": {score_number(first.judged.point)}"
@@ -389,7 +389,7 @@ def places_without_a_run(analysis: StudyAnalysis) -> list[str]:
 
 
 def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> str:
-    agents, words = environment.agents, METRIC_WORDS[study.metric]
+    agents, words = environment.agents, study.metric_words
     if math.isnan(agents[0].runs.mean):
         hint = "" if math.isnan(agents[0].regret.point) else "; bandits have --metric regret"
         return f"No run has a figure for the {words}{hint}."

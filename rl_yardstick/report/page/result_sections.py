@@ -14,7 +14,7 @@ from rl_yardstick.experiments.analysis import EnvironmentAnalysis
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.pool import ERROR_FILE
 from rl_yardstick.experiments.results import StudyResults, mixed_versions
-from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, StudySpec
+from rl_yardstick.experiments.study import COSTS, StudySpec
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.report import words
@@ -30,7 +30,7 @@ MOST_DOTS = 300  # of an agent on an environment; of more runs as many, evenly s
 def verdict(report: Report) -> Section | None:
     """The answer, all runs as dots, the words by pair, and for each environment its sentences."""
     analysis, environments = report.analysis, report.series.environments
-    study, metric = analysis.study, METRIC_WORDS[analysis.study.metric]
+    study, metric = analysis.study, analysis.study.metric_words
     scores = [runs for one in analysis.environments if one.is_score for runs in one.scores.values()]
     n_high = sum(int((runs >= SCORES[1]).sum()) for runs in scores)
     is_stretched = 2 * n_high > sum(int(np.isfinite(runs).sum()) for runs in scores)
@@ -112,7 +112,7 @@ def ranking(report: Report) -> Section | None:
             "changes": words.on_changes([environment]),
         }
         tables.append(table)
-    context = {"tables": tables, "metric": METRIC_WORDS[study.metric]}
+    context = {"tables": tables, "metric": study.metric_words}
     return Section("ranking", "Ranking", context, by_environment=True)
 
 
@@ -165,7 +165,7 @@ def comparison(report: Report) -> Section | None:
     study = report.analysis.study
     if not any(one.pairs for one in report.analysis.environments):
         return None
-    context = {"metric": METRIC_WORDS[study.metric], "lower_is_better": study.metric in COSTS}
+    context = {"metric": study.metric_words, "lower_is_better": study.metric in COSTS}
     return Section("comparison", "Differences", context, by_environment=True)
 
 
@@ -258,9 +258,9 @@ def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
     """Missing runs, grouped by agent, environment and reason: an error's last line."""
     groups: dict[tuple[str, str, str], dict[str, Any]] = {}
     unreadable = {one.planned.path: one.reason for one in results.left_out}
-    there = {run.path for run in results.finished}
+    there = {*results.summary["path"]}
     for run in results.planned:
-        if run.path in there:
+        if str(run.path) in there:
             continue
         details, error = results.failures.get(run.path, ""), run.path / ERROR_FILE
         details = (read_text(error) if details and error.exists() else details).strip()

@@ -103,7 +103,7 @@ def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> l
     found = []
     for agent in environment.agents:
         rows = exact[exact["agent"] == agent.agent].sort_values("final", kind="stable")
-        if len(rows):
+        if len(rows) and runs:  # none where the runs were done elsewhere
             found.append(runs[agent.agent, int(rows["seed"].iloc[(len(rows) - 1) // 2])])
     return found
 

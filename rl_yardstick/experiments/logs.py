@@ -1,0 +1,332 @@
+"""Reads the logs of runs that were done elsewhere; every file is data.
+
+A folder with logs of its own is one run. A table has a row for each run, or for each step of each.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rl_yardstick.experiments.results import LAST_EPISODES as LAST
+from rl_yardstick.experiments.results import MAX_TABLE, Episodes, joined_episodes, read_evaluations
+from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline.errors import UserError, one_line, unknown
+from rl_yardstick.pipeline.files import read_bytes
+from rl_yardstick.pipeline.run import RECORD, Run
+from rl_yardstick.pipeline.settings import read_saved
+
+# The kinds of final figures, the best first; those of tables are named as their columns.
+FINAL, EVALUATION, TRAINING = "final", "evaluation", "training"
+WORDS = {
+    FINAL: "return of the final policy",
+    EVALUATION: "return in the last evaluation",
+    TRAINING: f"return of the last {LAST} training episodes",
+}
+# The usual names of columns, in small letters, without what stands before a slash; best first.
+NAMES = {
+    "agent": "agent algo algorithm method agent_name algo_name name model",
+    "env": "env environment env_id env_name task game",
+    "seed": "seed run trial run_id n_simu simulation repetition",
+    "step": "global_step total_timesteps timesteps_total timesteps timestep num_timesteps steps "
+    "step episode iteration epoch",
+    "score": "score final_score final_return mean_return mean_reward ep_rew_mean eprewmean "
+    "episode_reward_mean avg_episodic_return episodic_return episode_return episode_reward "
+    "episode_rewards average_return average_reward total_reward return returns eval_rewards reward "
+    "rewards value r",
+}
+# Columns with an episode of training in each row, and with means over such episodes.
+OF_EPISODES = ("episodic_return", "episode_return", "episode_reward", "episode_rewards", "r")
+OF_MEANS = ("ep_rew_mean", "eprewmean", "episode_reward_mean", "avg_episodic_return")
+_OF_RUN = re.compile(r"(\d+\.)?monitor\.csv|evaluations\.npz|progress\.csv|run\.json|.*tfevents.*")
+
+
+NOTHING = Episodes(np.empty(0), np.empty(0), np.empty(0))
+
+
+@dataclass
+class Log:
+    """The log of one run."""
+
+    place: str  #: its folder, its file without the suffix, or its name in a table
+    path: Path  #: the folder or file
+    labels: Mapping[str, str] = field(default_factory=dict)  #: agent, env and seed, as far as told
+    env: str = ""  #: its environment, where a header or a file of settings tells it
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)  #: the environment's arguments
+    figures: dict[str, float] = field(default_factory=dict)  #: final figures by kind
+    recorded: Mapping[str, Any] = field(default_factory=dict)  #: all figures of `FINAL`
+    evaluations: Episodes = NOTHING  #: the curve of evaluations, or of a column of a table
+    episodes: Episodes = NOTHING  #: those of training
+    monitors: list[Floats] = field(default_factory=list)  #: those in each of Monitor's files
+    is_of_events: bool = False  #: of event files alone, as beside another log of the same run
+
+    def add(self, name: str, steps: Any, values: Any) -> None:
+        """Add the curve in a column, and its final figure, unless there is one of this kind."""
+        rows = np.column_stack([steps, values]).astype(np.float64)
+        rows = rows[np.isfinite(rows).all(axis=1)]
+        steps, values = rows[np.argsort(rows[:, 0], kind="stable")].T
+        kind, n = kind_of(name), LAST if _short(name) in OF_EPISODES else 1
+        if len(values) and kind not in self.figures:
+            self.figures[kind] = float(values[-n:].mean())
+            line = Episodes(steps, values, np.zeros(len(steps)))
+            if kind == TRAINING:
+                self.episodes = line
+            elif kind == EVALUATION or not len(self.evaluations.steps):
+                self.evaluations = line
+
+
+@dataclass
+class Found:
+    """All logs in what was given, and remarks on them."""
+
+    logs: list[Log] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)  #: why each other file is no log
+
+    @contextmanager
+    def noting(self) -> Iterator[None]:
+        """Note the error of a file that is no log."""
+        try:
+            yield
+        except (UserError, OSError) as error:
+            self.skipped.append(one_line(error))
+
+
+def find_logs(paths: Sequence[Path], columns: Mapping[str, str]) -> Found:
+    """Read all logs in files and folders; ``columns`` has a table's own names by those in `NAMES`.
+
+    Raises:
+        UserError: if a named file is no log, or nothing was found.
+    """
+    found, typed = Found(), dict[Path, list[str]]()
+    if strange := [name for name in columns if name not in NAMES]:
+        raise unknown("--columns: unknown", strange[0], NAMES)
+    for path in paths:
+        if not path.is_dir():
+            typed.setdefault(path.parent, []).append(path.name)
+        for folder, below, names in os.walk(path):
+            below[:] = sorted(name for name in below if not name.startswith("."))
+            if "verdicts.json" not in names:  # else the tables here are this project's
+                _read_folder(Path(folder), names, columns, found)
+    n_skipped = len(found.skipped)
+    for parent, names in typed.items():
+        _read_folder(parent, names, columns, found)
+    if found.skipped[n_skipped:]:
+        raise UserError(found.skipped[n_skipped])
+    if not found.logs:
+        kinds = "monitor.csv, evaluations.npz, progress.csv, event files or tables as .csv"
+        raise UserError("; ".join([f"no logs in {paths[0]}: give {kinds}", *found.skipped[:1]]))
+    if n := len(found.skipped):
+        found.notes.append(f"skipped {n:,} file{'s' * (n > 1)}: {'; '.join(found.skipped[:3])}")
+    return found
+
+
+def _read_folder(folder: Path, names: list[str], columns: Mapping[str, str], found: Found) -> None:
+    """Read the logs among these files of a folder, each of which may be damaged."""
+    of_run = list(filter(_OF_RUN.fullmatch, names))
+    run = Log(str(folder.resolve()), folder, is_of_events=all("tfevents" in n for n in of_run))
+    logs = [run] if of_run else []
+    with found.noting():
+        _add_settings(run, of_run)
+    for name in sorted(names):
+        path, start = folder / name, re.sub(r"[._-]?(monitor\.csv|npz)$", "", name)
+        log = run if name in of_run else Log(f"{run.place}/{start}", path)
+        logs += [] if name in of_run else [log]
+        with found.noting():
+            if name.endswith("monitor.csv"):
+                _add_monitor(log, path, found.notes)
+            elif path.suffix == ".npz" and name not in _NO_LOGS:
+                log.add(EVALUATION, *read_evaluations(path))
+            elif name == "progress.csv":
+                table = _read_table(path, found.notes)
+                step = _named_columns(table, {}, path).get("step")
+                _add_columns(log, table, step, returns_in(table.columns))
+            elif path.suffix in (".csv", ".tsv") and name not in _NO_LOGS:
+                logs += table_logs(_read_table(path, found.notes), path, columns, found.notes)
+            elif "tfevents" in name:
+                _add_events(log)
+    found.logs += [log for log in logs if log.figures]
+
+
+# --- run folders ----------------------------------------------------------------------------------
+
+_TEXTS = ("acts_by", "measured_by")  # among final figures
+# Other files in run folders of this project.
+_NO_LOGS = ("diagnosis.csv", "value_maps.npz", "pulls.npz", "pull_statistics.npz")
+
+
+def _add_settings(log: Log, names: Sequence[str]) -> None:
+    """Add what a run of this project or of rl_zoo3 has recorded of itself."""
+    saved: dict[str, Any] = {}
+    for file in ("config.yml", "args.yml"):  # rl_zoo3 uses the latter before the former
+        for path in log.path.glob(f"*/{file}") if names else ():
+            saved |= {key: value for key, value in read_saved(path).items() if value}
+    env, kwargs = saved.get("env"), saved.get("env_kwargs")
+    log.env, log.env_kwargs = str(env or ""), kwargs if isinstance(kwargs, dict) else {}
+    final = Run(log.path).recorded().get("final") if RECORD in names else None
+    if isinstance(final, dict) and isinstance(final.get("mean_return"), int | float):
+        kinds = {name: str if name in _TEXTS else int | float for name in final}
+        kept = {name: one for name, one in final.items() if isinstance(one, kinds[name])}
+        log.recorded = kept if "baseline" in kept else {}  # else it is on no scale
+        log.figures[FINAL] = float(final["mean_return"])
+
+
+def _add_monitor(log: Log, path: Path, notes: list[str]) -> None:
+    """Add the episodes in a file of Monitor; rows that are none are named and skipped."""
+    width, rows, faulty = 0, list[list[float]](), list[str]()
+    text = read_bytes(path, MAX_TABLE).decode(errors="replace")
+    for number, line in enumerate(text.splitlines(), start=1):
+        cells = line.split(",")
+        if line.startswith("#"):  # settings as JSON
+            log.env = log.env or "".join(re.findall(r'"env_id": *"([^"]+)"', line)[:1])
+        elif line.startswith("r,l"):
+            width = len(cells)
+        elif line.strip():
+            width = width or len(cells)
+            with suppress(ValueError):
+                r, length, t = map(float, cells[:3])
+                if len(cells) == width and isfinite(r + t) and length >= 1:
+                    rows.append([r, length, t])
+                    continue
+            faulty.append(str(number))
+    if faulty and not rows:
+        raise UserError(f"{path} is no log of episodes: it needs rows of r,l,t")
+    if n := len(faulty):
+        which = f"line{'s' * (n > 1)} {', '.join(faulty[:5])}{', ...' * (n > 5)}"
+        notes.append(f"{path}: skipped {n:,} of {n + len(rows):,} rows, no episodes: {which}")
+    log.monitors += [np.array(rows)] if rows else []
+    if log.monitors:  # the mean over the environments of the run
+        log.figures[TRAINING] = float(np.mean([one[-LAST:, 0].mean() for one in log.monitors]))
+        log.episodes = joined_episodes(log.monitors)
+
+
+def _add_events(log: Log) -> None:
+    """Add the returns in TensorBoard's event files, by tag."""
+    if importlib.util.find_spec("tensorboard") is None:
+        raise UserError(f"{log.path}: event files need: pip install 'rl-yardstick[tensorboard]'")
+    module = "tensorboard.backend.event_processing.event_accumulator"
+    events = importlib.import_module(module).EventAccumulator(str(log.path), {"scalars": 0})
+    try:
+        events.Reload()
+        for tag in returns_in(events.Tags()["scalars"]):
+            log.add(tag, *np.transpose([(one.step, one.value) for one in events.Scalars(tag)]))
+    except Exception as error:  # TensorBoard's, of a damaged file
+        raise UserError(f"{log.path}: damaged event files: {one_line(error)}") from error
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def _short(name: str) -> str:
+    """A column's name in small letters, without what stands before a slash."""
+    return re.sub(r"[^a-z0-9]+", "_", name.lower().rpartition("/")[2]).strip("_")
+
+
+def kind_of(name: str) -> str:
+    """The kind of figure in a column: of evaluations, of training episodes, or its own name."""
+    is_of_training = _short(name) in (*OF_EPISODES, *OF_MEANS)
+    return EVALUATION if "eval" in name.lower() else TRAINING if is_of_training else name
+
+
+def returns_in(names: Iterable[str]) -> list[str]:
+    """The columns of returns among these: the best of each kind."""
+    known = NAMES["score"].split()
+    places = [(known.index(_short(name)), name) for name in names if _short(name) in known]
+    return list({kind_of(name): name for _, name in sorted(places, reverse=True)}.values())[::-1]
+
+
+def _read_table(path: Path, notes: list[str]) -> pd.DataFrame:
+    """A text table with a row of headings; commas, semicolons or tabs separate its cells."""
+    content = read_bytes(path, MAX_TABLE).decode(errors="replace")
+    separator = max(",;\t", key=content.partition("\n")[0].count)
+    try:
+        table = pd.read_csv(io.StringIO(content), sep=separator, on_bad_lines="skip")
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is no table: {one_line(error)}") from error
+    if n := sum(map(bool, content.splitlines())) - 1 - len(table):
+        notes.append(f"{path}: skipped {n:,} rows with more cells than headings")
+    return table
+
+
+def table_logs(
+    table: pd.DataFrame, path: Path, columns: Mapping[str, str], notes: list[str]
+) -> list[Log]:
+    """The runs in a table; UserError if it has no column of returns."""
+    table = table.rename(columns=str)
+    if {"tag", "value"} <= {*table.columns}:  # as rlberry exports: a column for each tag
+        tags = returns_in(map(str, table["tag"].unique()))
+        values = {tag: table["value"].where(table["tag"] == tag) for tag in tags}
+        table = table.drop(columns=["tag", "value"]).assign(**values)
+    if charts := _chart_logs(table, path):
+        return charts
+    names, keys = _named_columns(table, columns, path), ("agent", "env", "seed")
+    scores = [columns["score"]] if "score" in columns else returns_in(table.columns)
+    if not scores:
+        held = ", ".join(table.columns[:8])
+        raise UserError(f"{path} has no known column of returns ({held}): --columns score=NAME")
+    table = table[table[scores].apply(pd.to_numeric, errors="coerce").notna().any(axis=1)]
+    step, given = names.get("step"), [key for key in keys if key in names]
+    if "seed" not in names:
+        by = [table[names[key]] for key in given] or [pd.Series(0, table.index)]
+        part = table.groupby(by).cumcount()
+        if step is not None:
+            part = (pd.to_numeric(table[step]).groupby(by).diff() < 0).groupby(by).cumsum() + 0
+        table, names["seed"], given = table.assign(seed=part), "seed", [*given, "seed"]
+        taken = "each row" if step is None else f"each part, to where {step!r} falls,"
+        notes.append(f"{path} has no column of seeds: {taken} counts as a seed")
+    logs = []
+    for of, rows in table.groupby([names[key] for key in given], sort=False):
+        texts = [re.sub(r"\.0$", "", str(value)) for value in of]
+        log = Log(", ".join([str(path), *texts]), path, dict(zip(given, texts, strict=True)))
+        _add_columns(log, rows, step, scores)
+        logs.append(log)
+    return logs
+
+
+def _named_columns(table: pd.DataFrame, columns: Mapping[str, str], path: Path) -> dict[str, str]:
+    """The columns of agent, environment, seed and step that are given, or have usual names."""
+    if wrong := [name for name in columns.values() if name not in table.columns]:
+        raise unknown(f"{path}: no column", wrong[0], table.columns)
+    filled = {_short(name): name for name in table.columns[::-1] if table[name].notna().any()}
+    found = {key: known for key, known in columns.items() if key != "score"}
+    for key in {"agent", "env", "seed", "step"} - found.keys():
+        usual = [filled[name] for name in NAMES[key].split() if name in filled]
+        found |= {key: usual[0]} if usual else {}
+    return found
+
+
+def _add_columns(log: Log, rows: pd.DataFrame, step: str | None, scores: Sequence[str]) -> None:
+    """Add the curves or the mean figures in the rows of a run."""
+    for name in scores:
+        values = pd.to_numeric(rows[name], errors="coerce").to_numpy(np.float64)
+        if step is not None:
+            is_of_episodes = _short(step) == "episode" and kind_of(name) == name
+            steps = pd.to_numeric(rows[step], errors="coerce")
+            log.add("r" if is_of_episodes else name, steps, values)
+        elif len(rows) > 1 and _short(name) in OF_EPISODES:
+            log.add(name, np.arange(1, len(values) + 1), values)
+        elif np.isfinite(values).any():
+            log.figures.setdefault(kind_of(name), float(np.nanmean(values)))
+
+
+def _chart_logs(table: pd.DataFrame, path: Path) -> list[Log]:
+    """The runs of a chart that Weights & Biases exported, with columns ``NAME - METRIC``."""
+    logs: dict[str, Log] = {}
+    for column in table.columns[1:]:
+        name, _, metric = column.rpartition(" - ")
+        if name and returns_in([metric]):
+            name = re.sub(r"^[^:/]+: ", "", name)  # of a group
+            log = logs.setdefault(name, Log(name, path))
+            log.add(metric, table.iloc[:, 0], pd.to_numeric(table[column], errors="coerce"))
+    return list(logs.values())

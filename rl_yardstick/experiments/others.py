@@ -1,0 +1,263 @@
+"""Judges runs that were done elsewhere, from their logs, as the runs of a study are judged."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pandas as pd
+
+from rl_yardstick.experiments.analysis import StudyAnalysis, analyse
+from rl_yardstick.experiments.logs import FINAL, WORDS, Found, Log, find_logs, table_logs
+from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.results import (
+    HIDDEN_COLUMNS,
+    OF_RUN,
+    RUN_COLUMNS,
+    RunResults,
+    StudyResults,
+    evaluation_curve,
+    joined,
+    summary_row,
+    training_curve,
+)
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, Metric, StudySpec
+from rl_yardstick.pipeline.environments import MISTAKES
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+from rl_yardstick.pipeline.spec import TrainSpec, validated
+
+# Regular expressions of labels in paths: of ids of Gymnasium, and of seeds with a word before them.
+FORMS = {"agent": "[^/]+?", "env": r"[A-Za-z0-9.-]+-v\d+", "seed": r"(?:(?:seed|run|s)[-_=]?)?\d+"}
+# The first that fits the end of a path is taken.
+PATTERNS = (
+    *("{agent}/{env}_{seed}", "{agent}/{env}/{seed}", "{env}/{agent}/{seed}"),
+    *("{env}/{agent}_{seed}", "{env}__{agent}__{seed}__*", "{agent}_{env}_{seed}"),
+    *("{env}_{agent}_{seed}", "{agent}/{env}", "{env}/{agent}", "{agent}/{seed}"),
+    *("{agent}_{seed}", "{agent}"),
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """How logs are read and judged."""
+
+    pattern: str = ""  #: where paths have agent, env and seed; empty for one of `PATTERNS`
+    columns: Mapping[str, str] = field(default_factory=dict)  #: a table's own, by the usual names
+    env: str = "environment"  #: the environment of runs whose logs name none
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)  #: its arguments, for the optimum
+    metric: Metric = "final"  #: the figure that verdicts compare
+    margin: float | None = None  #: the difference within which agents are tied
+    figures: tuple[str, ...] = ("png", "svg")  #: formats of figures
+
+
+# --- agent, environment and seed ------------------------------------------------------------------
+
+
+def labels_in(place: str, pattern: str, forms: Mapping[str, str] = FORMS) -> dict[str, str]:
+    """The labels at the end of a path, empty where the pattern does not fit; ``*`` is any text."""
+    text, *others = re.split(r"\{(\w*)\}", pattern)
+    names, regex = others[::2], re.escape(text)
+    if "agent" not in names or len({*names}) < len(names) or not {*names} <= {*forms}:
+        raise UserError(f"--pattern {pattern}: name agent, env and seed, as in {PATTERNS[0]}")
+    for name, text in zip(names, others[1::2], strict=True):
+        regex += f"(?P<{name}>{forms[name]}){re.escape(text)}"
+    found = re.search("(?:^|/)" + regex.replace(r"\*", "[^/]*") + "$", place.replace("\\", "/"))
+    return {} if found is None else found.groupdict()
+
+
+def _labelled(found: Found, options: Options) -> list[Log]:
+    """The logs with all labels, in order, one for each agent, environment and seed."""
+    patterns = [options.pattern] if options.pattern else [*PATTERNS]
+    forms = {**FORMS, "env": "[^/]+?"} if options.pattern else FORMS
+    used, runs = Counter[str](), dict[tuple[str, ...], Log]()
+    for log in sorted(found.logs, key=lambda log: log.is_of_events):
+        if "agent" not in log.labels:
+            place = str(log.path.with_suffix("")) if log.labels else log.place
+            read = ((one, labels_in(place, one, forms)) for one in patterns)
+            pattern, in_path = next((pair for pair in read if pair[1]), ("", {}))
+            if not in_path:
+                raise UserError(f"--pattern {options.pattern} does not fit {place}")
+            log.labels = {**in_path, **log.labels}
+            used[pattern] += 1
+        seed = re.sub(r"^\D+(?=\d+$)", "", log.labels.get("seed", ""))
+        environment = log.labels.get("env") or log.env or options.env
+        log.labels = {"agent": log.labels["agent"], "env": environment, "seed": seed}
+        key = (*log.labels.values(), "" if seed else log.place)
+        if key in runs and not log.is_of_events:
+            both = f"{runs[key].place} and {log.place}"
+            raise UserError(f"two runs are {', '.join(key[:3])}: {both}; --pattern splits them")
+        runs.setdefault(key, log)
+    for pattern, n in used.items():
+        found.notes.append(f"labels of {n:,} from their paths, by --pattern '{pattern}'")
+    if n := sum(not log.labels["seed"] for log in runs.values()):
+        found.notes.append(f"{n:,} runs without a seed are numbered in their order")
+    return [runs[key] for key in sorted(runs, key=lambda key: (*key[:2], key[2].zfill(20)))]
+
+
+# --- from logs to a study -------------------------------------------------------------------------
+
+
+def results_of(found: Found, options: Options, root: Path) -> StudyResults:
+    """The logs as the results of a study in the folder ``root``; adds notes to ``found``.
+
+    Raises:
+        UserError: if labels are missing, or are those of two runs.
+    """
+    every, notes = _labelled(found, options), found.notes
+    counts = Counter(kind for log in every for kind in log.figures)
+    kind = max([*WORDS, *counts], key=lambda kind: counts[kind])  # the first that most runs have
+    logs = [log for log in every if kind in log.figures]
+    is_last = any(len(log.evaluations.steps) for log in logs)
+    words = WORDS.get(kind) or f"{'last ' if is_last else ''}{kind}"
+    notes.append(f"figure of each run: {'mean ' if kind in WORDS else ''}{words}")
+    if n := len(every) - len(logs):
+        notes.append(f"left out: {n:,} run{'s' * (n > 1)} without such a figure")
+    labels = [(log.labels["agent"], log.labels["env"]) for log in logs]
+    agents = list(dict.fromkeys(agent for agent, _ in labels))
+    if len(agents) == 1:
+        notes.append(f"one agent only, {agents[0]}: a comparison needs two")
+    places = {env: _place(env, logs, options) for env in dict.fromkeys(env for _, env in labels)}
+    ranks = [labels[:k].count(one) for k, one in enumerate(labels)]
+    seeds = [log.labels["seed"] for log in logs]
+    first = int(seeds[0]) if seeds[0].isdigit() else 0
+    if seeds != [str(first + rank) for rank in ranks]:
+        first = 0
+        notes.append("seeds are numbered from 0 for each agent")
+    study = StudySpec(
+        name=root.name,
+        title=f"{', '.join(agents)} on {', '.join(places)}",
+        agents=tuple(AgentSpec(agent, "") for agent in agents),
+        environments=tuple(EnvironmentSpec(one, spec.env_id) for one, (spec, _) in places.items()),
+        n_seeds=max(ranks) + 1,
+        first_seed=first,
+        metric=options.metric,
+        margin=options.margin,
+        figures=options.figures,
+        figure=words,
+    )
+    planned = [
+        PlannedRun(*of, first + rank, places[of[1]][0], Path(log.place))
+        for of, rank, log in zip(labels, ranks, logs, strict=True)
+    ]
+    scales = [places[run.environment][1] for run in planned]
+    runs = [
+        _read(study, run, log, kind, scale)
+        for run, log, scale in zip(planned, logs, scales, strict=True)
+    ]
+    rows, curves = [one.rows[0] for one in runs], [curve for one in runs for curve in one.curves]
+    _note_budgets(rows, notes)
+    hidden = HIDDEN_COLUMNS if any(row["full_optimum"] is not None for row in rows) else ()
+    table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *hidden])
+    return StudyResults(study, root, table, joined(curves), tuple(planned))
+
+
+def _place(place: str, logs: Sequence[Log], options: Options) -> tuple[TrainSpec, Yardstick | None]:
+    """The environment of runs and its scale; the id is empty if it is not known, or differs by run.
+
+    A log imports no module: only Gymnasium's and this project's, and those imported before, count.
+    """
+    from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single
+    from rl_yardstick.pipeline.evaluation.sampled import bracketed_yardstick
+
+    given, unknown = options.env_kwargs, validated({"algo": "", "env_id": "", "n_timesteps": 1})
+    kwargs = [dict(given or log.env_kwargs) for log in logs if log.labels["env"] == place]
+    for env_id in (place, place.replace("-", "/", 1)):
+        entry = gym.registry[env_id].entry_point if env_id in gym.registry else None
+        module = entry.partition(":")[0] if isinstance(entry, str) else "rl_yardstick."
+        is_trusted = module.startswith(("gymnasium.", "rl_yardstick.")) or module in sys.modules
+        if entry is not None and is_trusted and kwargs == kwargs[:1] * len(kwargs):
+            spec = unknown.changed(env_id=env_id, env_kwargs=kwargs[0])
+            with suppress(UserError, *MISTAKES):
+                exact = evaluator_of_single(spec)
+                return spec, bracketed_yardstick(spec) if exact is None else exact.yardstick
+    return unknown, None
+
+
+def _read(
+    study: StudySpec, run: PlannedRun, log: Log, kind: str, scale: Yardstick | None
+) -> RunResults:
+    """A run's row of the summary and its curves, as those of a run folder."""
+    evaluated, episodes, value = log.evaluations, log.episodes, log.figures[kind]
+    figures = {} if scale is None else scale.figures(value)
+    own = log.recorded if kind == FINAL else {}
+    recorded = {
+        **dict.fromkeys(OF_RUN),
+        "final": {"mean_return": value, "exact": False, **figures, **own},
+        "best_mean_return": max(evaluated.returns, default=None),
+        "n_timesteps": max([*evaluated.steps[-1:], *episodes.steps[-1:]], default=None),
+    }
+    curve = evaluation_curve(run, episodes, evaluated.steps, evaluated.returns)
+    row = summary_row(study, run, recorded, episodes, curve)
+    labels = {"agent": run.agent, "environment": run.environment, "path": log.place}
+    named = {**row, **labels, "env_id": run.spec.env_id}
+    return RunResults([named], [curve, training_curve(run, episodes)])
+
+
+def _note_budgets(rows: Sequence[Mapping[str, Any]], notes: list[str]) -> None:
+    """Note where the runs of some agents are longer than those of others."""
+    table = pd.DataFrame(rows).astype({"n_timesteps": float})
+    for place, here in table.groupby("environment", sort=False):
+        steps = here.groupby("agent")["n_timesteps"].median().dropna().sort_values()
+        if len(steps) > 1 and steps.iloc[-1] > 1.1 * steps.iloc[0]:
+            low, *_, high = (f"{n:,.0f} ({agent})" for agent, n in steps.items())
+            notes.append(f"{place}: budgets differ, from {low} to {high} steps")
+
+
+# --- in Python ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The judgement of runs that were done elsewhere."""
+
+    analysis: StudyAnalysis  #: all figures and verdicts
+    notes: list[str]  #: on what was read, left out and assumed
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row for each agent on each environment, the best first; ``n`` counts its runs."""
+        rows = [
+            {"environment": one.environment, "agent": agent.agent, **asdict(agent.metric.mean)}
+            | {"score": agent.score and agent.score.point, "optimum": one.optimum}
+            for one in self.analysis.environments
+            for agent in one.agents
+        ]
+        return pd.DataFrame(rows).rename(columns={"point": "mean"}).dropna(axis=1, how="all")
+
+    @property
+    def verdicts(self) -> pd.DataFrame:
+        """A row for each pair of agents, the word on the first, the difference of the means."""
+        pairs = [pair for one in self.analysis.environments for pair in one.pairs]
+        return pd.DataFrame([{"verdict": pair.text, **asdict(pair)} for pair in pairs])
+
+    def _repr_html_(self) -> str:
+        tables = [table.to_html(index=False, na_rep="") for table in (self.table, self.verdicts)]
+        return "".join([*tables, *(f"<p>{escape(note)}</p>" for note in self.notes)])
+
+
+def judge(what: pd.DataFrame | str | Path | Sequence[str | Path], **options: Any) -> Judgement:
+    """Judge runs by their logs, or by a table with a row for each score or step.
+
+    Args:
+        what: the table, or files and folders.
+        options: the fields of `Options`.
+
+    Raises:
+        UserError: if nothing was found, or labels are missing or not unique.
+    """
+    chosen, found = Options(**options), Found()
+    if isinstance(what, pd.DataFrame):
+        found.logs += table_logs(what, Path("table"), chosen.columns, found.notes)
+    else:
+        paths = [what] if isinstance(what, str | Path) else what
+        found = find_logs([Path(path) for path in paths], chosen.columns)
+    return Judgement(analyse(results_of(found, chosen, Path("runs"))), found.notes)

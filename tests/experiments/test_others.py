@@ -1,0 +1,313 @@
+"""Logs of runs that were done elsewhere, in the forms that other programs write them."""
+
+import json
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+from stable_baselines3 import A2C
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+
+from rl_yardstick.experiments.logs import find_logs
+from rl_yardstick.experiments.others import PATTERNS, judge, labels_in
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.report.series import learning_curves
+from tests.pipeline.short_runs import trained
+
+ROOT = Path(__file__).parents[2]
+
+# The final figure of each run; sums and means of quarters are exact.
+FIGURES = {
+    (agent, seed): mean + (seed % 3) / 4
+    for agent, mean in (("good", 8.5), ("poor", 2.25))
+    for seed in range(1, 7)
+}
+
+
+def table(figures=FIGURES, **changes):
+    rows = [{"agent": a, "seed": s, "score": value} for (a, s), value in figures.items()]
+    return pd.DataFrame(rows).assign(**changes)
+
+
+def episodes(value):
+    """Of which the last hundred have this mean."""
+    return [0.0] * 20 + [value - 1, value + 1] * 50
+
+
+class OneStep(gym.Env):
+    """Episodes of one step with the given returns, again and again."""
+
+    observation_space, action_space = gym.spaces.Discrete(2), gym.spaces.Discrete(2)
+
+    def __init__(self, returns):
+        self.returns, self.n = returns, 0
+
+    def reset(self, *, seed=None, options=None):
+        return 0, {}
+
+    def step(self, action):
+        self.n += 1
+        return 0, self.returns[(self.n - 1) % len(self.returns)], True, False, {}
+
+
+def monitor(path, returns):
+    env = Monitor(OneStep(returns), str(path))
+    for _ in returns:
+        env.reset()
+        env.step(0)
+    env.close()
+
+
+def monitors(folder, value):
+    """Of two environments, the second with fewer episodes: they count alike."""
+    monitor(folder / "0", [value + 0.5] * 130)
+    monitor(folder / "1", [value - 0.5] * 30)
+
+
+def old_monitor(folder, value):
+    rows = "".join(f"{r},1,{0.5 * k}\n" for k, r in enumerate(episodes(value)))
+    (folder / "monitor.csv").write_text(rows)
+
+
+def damaged_monitor(folder, value):
+    monitor(folder / "0", episodes(value))
+    path = folder / "0.monitor.csv"
+    first, second, *rows = path.read_text().splitlines()
+    torn = [*rows[:9], "3.0,1,2.5514.0,1,2.75", *rows[9:], "nan,1,3.0", "8.0,1"]
+    path.write_text("\n".join([first, second, *torn]))
+
+
+def evaluations(folder, value):
+    env = Monitor(OneStep([value - 1, value + 1]))
+    log = EvalCallback(env, eval_freq=8, n_eval_episodes=2, log_path=str(folder), verbose=0)
+    learner().learn(16, callback=log)
+
+
+@cache
+def learner():
+    return A2C("MlpPolicy", OneStep([0.0]), n_steps=4, device="cpu", seed=0)
+
+
+def progress(folder, value, kind="csv"):
+    log = configure(str(folder), [kind])
+    for step, mean in ((100, 0.25), (200, value)):
+        log.record("rollout/ep_rew_mean", mean)
+        log.record("time/total_timesteps", step)
+        log.record("train/value_loss", 99.0)
+        log.dump(step)
+    log.close()
+
+
+def events(folder, value):
+    progress(folder, value, "tensorboard")
+
+
+@pytest.mark.parametrize(
+    "write", [monitors, old_monitor, damaged_monitor, evaluations, progress, events]
+)
+def test_run_folders_are_judged_as_their_numbers_are(tmp_path, write):
+    for (agent, seed), value in FIGURES.items():
+        folder = tmp_path / agent / f"Lake-v7_{seed}"
+        folder.mkdir(parents=True)
+        write(folder, value)
+    found = judge(tmp_path)
+    curves = learning_curves(found.analysis.results, found.analysis.environments[0])
+    assert {one.budget for one in curves.values()} == {"step"}
+    check(found, "last evaluation" if write is evaluations else "last 100 training")
+
+
+def check(found, words):
+    expected = judge(table(env="Lake-v7"))
+    pd.testing.assert_frame_equal(found.table, expected.table)
+    pd.testing.assert_frame_equal(found.verdicts, expected.verdicts)
+    assert expected.verdicts["verdict"].tolist() == ["better"]
+    assert words in " ".join(found.notes)
+    assert found.analysis.study.seeds == range(1, 7)
+
+
+def curves(name, n=3):
+    """A row for each step of each run; the last one has the figure."""
+    return pd.DataFrame(
+        {"algo": agent, "run": seed, "global_step": 100 * k, name: k if k < n else value}
+        for (agent, seed), value in FIGURES.items()
+        for k in range(1, n + 1)
+    )
+
+
+def episodes_table():
+    return pd.concat(
+        pd.DataFrame({"method": a, "trial": s, "episode": range(120), "Return": episodes(value)})
+        for (a, s), value in FIGURES.items()
+    )
+
+
+def of_rlberry():
+    long = curves("value").rename(columns={"algo": "name", "run": "n_simu"})
+    times = long.assign(tag="dw_time_elapsed", value=7.0)
+    return pd.concat([times, long.assign(tag="eval_rewards")]).assign(dw_time_elapsed=0.5)
+
+
+def of_wandb():
+    names = {key: f"Lake-v7__{key[0]}__{key[1]}__1700000000" for key in FIGURES}
+    found = {"Step": [100, 200, 300]}
+    for key, value in FIGURES.items():
+        for end in ("", "__MIN", "__MAX"):
+            found[f"{names[key]} - charts/ep_rew_mean{end}"] = [1.0, np.nan, value]
+    return pd.DataFrame(found)
+
+
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        (table().rename(columns={"agent": "Algorithm", "score": "Mean Reward"}), "Mean Reward"),
+        (curves("return"), "last return"),
+        (curves("eval/mean_reward"), "last evaluation"),
+        (curves("rollout/ep_rew_mean"), "last 100 training"),
+        (episodes_table(), "last 100 training"),
+        (of_rlberry(), "last evaluation"),
+        (of_wandb(), "last 100 training"),
+    ],
+)
+def test_tables_are_judged_as_their_numbers_are(tmp_path, made, words):
+    path = tmp_path / "exported.csv"
+    made.to_csv(path, index=False, sep=";" if "eval" in words else ",")
+    check(judge(path, env="Lake-v7"), words)
+
+
+def test_columns_are_those_that_are_named(tmp_path):
+    made = table().rename(columns={"agent": "who", "score": "points"})
+    assert "points" in " ".join(judge(made, columns={"agent": "who", "score": "points"}).notes)
+    with pytest.raises(UserError, match=r"no known column of returns \(who, seed, points\)"):
+        judge(made)
+    with pytest.raises(UserError, match="no column 'whom': did you mean 'who'"):
+        judge(made, columns={"agent": "whom"})
+
+
+def test_scores_are_on_the_scale_where_the_environment_is_known():
+    """FrozenLake without slipping: the optimum is 1, and constant actions never arrive."""
+    figures = {key: value / 10 for key, value in FIGURES.items()}
+    found = judge(table(figures, env="FrozenLake-v1"), env_kwargs={"is_slippery": False})
+    one = found.analysis.environments[0]
+    assert one.optimum == 1.0
+    scores = [(row - one.baseline) / (1 - one.baseline) for row in found.table["mean"]]
+    assert found.table["score"].tolist() == pytest.approx(scores)
+    assert "optimum" not in judge(table(figures, env="OtherLake-v1")).table
+
+
+@pytest.mark.parametrize(
+    ("path", "labels"),
+    [
+        ("logs/ppo/CartPole-v1_3", ("ppo", "CartPole-v1", "3")),
+        ("x/dqn/ALE-Pong-v5/seed_12", ("dqn", "ALE-Pong-v5", "seed_12")),
+        ("runs/CartPole-v1__dqn__4__1700000000", ("dqn", "CartPole-v1", "4")),
+        ("res/LunarLander-v3/sac_s2", ("sac", "LunarLander-v3", "s2")),
+        ("res/my_agent_CartPole-v1_0", ("my_agent", "CartPole-v1", "0")),
+        ("tb/PPO_1", ("PPO", None, "1")),
+        ("out/mine", ("mine", None, None)),
+    ],
+)
+def test_the_first_usual_pattern_that_fits(path, labels):
+    found = next(found for one in PATTERNS if (found := labels_in(path, one)))
+    assert (found["agent"], found.get("env"), found.get("seed")) == labels
+
+
+def test_what_is_assumed_is_told(tmp_path):
+    unseeded = curves("return").drop(columns="run")
+    found = judge(unseeded)
+    assert found.table["n"].tolist() == [6, 6]
+    assert "no column of seeds: each part, to where 'global_step' falls," in found.notes[0]
+    assert "each row counts as a seed" in judge(table().drop(columns="seed")).notes[0]
+    short = curves("return").query("algo == 'good' or global_step < 300")
+    assert "budgets differ, from 200 (poor) to 300 (good) steps" in " ".join(judge(short).notes)
+    assert "one agent only, good" in " ".join(judge(table().query("agent == 'good'")).notes)
+    assert "seeds are numbered from 0" in " ".join(judge(table().query("seed != 3")).notes)
+
+
+def test_files_that_are_no_logs_are_counted(tmp_path):
+    (tmp_path / "notes.csv").write_text("day,weather\n1,sun\n")
+    (tmp_path / "arrays.npz").write_text("no archive")
+    (tmp_path / "0.monitor.csv").write_text("once upon a time\n")
+    table().to_csv(tmp_path / "scores.csv")
+    (note,) = find_logs([tmp_path], {}).notes
+    assert note.startswith("skipped 3 files: ")
+    assert "needs rows of r,l,t" in note
+    for name in ("notes.csv", "arrays.npz", "missing.csv"):
+        with pytest.raises(UserError, match=name):
+            judge(tmp_path / name)
+
+
+def test_rows_that_are_no_episodes_are_named(tmp_path):
+    damaged_monitor(tmp_path, 3.0)
+    found = find_logs([tmp_path], {})
+    (note,) = found.notes
+    assert note.endswith("skipped 3 of 123 rows, no episodes: lines 12, 124, 125")
+    assert found.logs[0].figures == {"training": 3.0}
+
+
+def test_labels_belong_to_one_run(tmp_path):
+    for place in ("a/ppo_1", "b/ppo_1"):
+        (tmp_path / place).mkdir(parents=True)
+        old_monitor(tmp_path / place, 3.0)
+    with pytest.raises(UserError, match="two runs are ppo, environment, 1"):
+        judge(tmp_path)
+    found = judge(tmp_path, pattern="{env}/{agent}_{seed}")
+    assert found.table["environment"].tolist() == ["a", "b"]
+    # Event files beside Monitor's, in a folder of their own, are of the same run.
+    (tmp_path / "tensorboard" / "b").mkdir(parents=True)
+    events(tmp_path / "tensorboard" / "b" / "ppo_1", 9.0)
+    assert judge(tmp_path, pattern="{env}/{agent}_{seed}").table["mean"].tolist() == [3.0, 3.0]
+    with pytest.raises(UserError, match="name agent, env and seed"):
+        judge(tmp_path, pattern="{algo}_{seed}")
+
+
+def test_files_of_strangers_import_no_module(tmp_path, monkeypatch):
+    """Neither an environment's id nor its arguments run code; damaged settings are no logs."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "taken.py").write_text("raise SystemExit('imported')")
+    gym.register("Taken-v0", entry_point="taken:Env")
+    try:
+        found = judge(table(env="Taken-v0"))
+    finally:
+        gym.registry.pop("Taken-v0")
+    assert found.analysis.environments[0].env_id == ""
+    folder = tmp_path / "ppo" / "Lake-v7_1"
+    folder.mkdir(parents=True)
+    old_monitor(folder, 3.0)
+    wrong, half = {"mean_return": 8.0, "optimum": "x"}, {"mean_return": 8.0, "optimum": 9.0}
+    for final, mean in (({"mean_return": "8"}, 3.0), (wrong, 8.0), (half, 8.0), ([1], 3.0)):
+        (folder / "run.json").write_text(json.dumps({"final": final}))
+        assert judge(tmp_path).table["mean"].tolist() == [mean]
+
+
+PAGE = (ROOT / "docs" / "other-runs.md").read_text()
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_the_commands_of_the_page(typed, own_folder):
+    """On runs of this project, whose final figures are those that they have recorded."""
+    runs = {name: trained(name, n_timesteps=300) for name in ("qlearning", "sarsa")}
+    finals = {name: outcome.final.mean_return for name, (_, outcome) in runs.items()}
+    table().to_csv("scores.csv")
+    for agent in ("ppo", "dqn"):
+        (own_folder / agent / "1").mkdir(parents=True)
+        monitor(own_folder / agent / "1" / "0", episodes(3.0))
+
+    for line in re.findall(r"^yardstick (.*?)(?: +#.*)?$", PAGE, re.MULTILINE):
+        page = [] if "scores" in line else ["--no-report"]
+        code, out, err = typed("yardstick", *shlex.split(line), "-f", "studies", *page)
+        assert (code, err) == (0, ""), f"{line}\n{out}{err}"
+    rows = pd.read_csv("studies/logs/summary.csv").set_index("agent")
+    assert rows["final"].to_dict() == finals
+    page = Path("studies/scores/report.html").read_text()
+    assert all(f'id="{part}"' in page for part in ("verdict", "ranking", "comparison"))
+    assert 'id="films"' not in page
+    assert "--seeds cannot be given with logs" in typed("compare.py", "logs", "--seeds", 3)[2]
+    assert "--pattern and --columns belong to logs" in typed("compare.py", "--pattern", "x")[2]
+    assert "nowhere is no folder or file" in typed("compare.py", "logs", "nowhere")[2]
