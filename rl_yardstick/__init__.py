@@ -1,1 +1,21 @@
-"""Tabular, bandit and deep reinforcement learning, measured against the exact optimum."""
+"""Tabular, bandit and deep reinforcement learning, measured against the exact optimum.
+
+The functions of ``import rl_yardstick as ys`` are in `rl_yardstick.api`, imported at first use.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_OF_API = ("Run", "Study", "audit", "compare", "explain", "optimum", "train", "tune")
+_HOMES = dict.fromkeys(_OF_API, "api") | {"judge": "experiments.others", "rate": "rating"}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands.cli import OneLineParser, flag, shared, whole_number, with_engine
-from rl_yardstick.diagnosis.faults import FAULTS, KINDS
+from rl_yardstick.diagnosis.faults import FAULTS, KINDS, Finding
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -60,14 +60,13 @@ def main() -> int:
         import torch as th
 
         th.set_num_threads(1)  # networks as small as these are slower with two
-        subject = _subject(args)
+        subject = subject_of(args)
         from rl_yardstick.diagnosis.audit import Verdict, audit
     say(console, f"audit of {subject.name}")
     findings = []
     for finding in audit(subject, range(args.seeds)):
         findings.append(finding)
-        reason = "" if finding.state in ("fault", "ok") else f": {finding.text}"
-        say(console, f"  {finding.probe:<36}{WORDS[finding.state]}{reason}")
+        say(console, finding_line(finding))
     verdict = Verdict(subject.name, tuple(findings))
     for line in verdict_lines(verdict):
         say(console, line)
@@ -76,7 +75,7 @@ def main() -> int:
     return verdict.exit_code
 
 
-def _subject(args: argparse.Namespace) -> Subject:
+def subject_of(args: argparse.Namespace) -> Subject:
     """The algorithm that the arguments select; imports its module."""
     from rl_yardstick.pipeline.components import import_modules
     from rl_yardstick.pipeline.settings import check_agent, parse_assignments
@@ -97,6 +96,12 @@ def _subject(args: argparse.Namespace) -> Subject:
     if args.engine is not None:
         raise UserError("--engine: a script has none")
     return ScriptSubject(name, function, typed, args.kind, wanted)
+
+
+def finding_line(finding: Finding) -> str:
+    """The finding of a probe, in a line."""
+    reason = "" if finding.state in ("fault", "ok") else f": {finding.text}"
+    return f"  {finding.probe:<36}{WORDS[finding.state]}{reason}"
 
 
 def verdict_lines(verdict: Verdict) -> list[str]:

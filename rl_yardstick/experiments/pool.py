@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import shutil
 import signal
 import sys
@@ -13,7 +14,7 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager, suppress
-from functools import cache, partial
+from functools import cache
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any, Self
@@ -93,13 +94,10 @@ def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
     if stop is not None:
         yield stop
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    stop = Stop().listen()
-    signal.signal(signal.SIGINT, before[signal.SIGINT])
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGTERM, before[signal.SIGTERM])
+    of_driver = signal.getsignal(signal.SIGINT)
+    with Stop().listening() as own:
+        signal.signal(signal.SIGINT, of_driver)
+        yield own
 
 
 # --- workers on this machine ----------------------------------------------------------------------
@@ -150,6 +148,20 @@ class Workers:
             self._pool = None
 
 
+#: What each worker calls first, by name: it registers the user's classes and environments, which
+#: may stand in a cell of a notebook.
+REGISTRATIONS: dict[str, Callable[[], object]] = {}
+
+
+def registrations() -> bytes:
+    """The registrations, as cloudpickle copies code that stands in no module."""
+    if not REGISTRATIONS:
+        return pickle.dumps([])
+    import cloudpickle
+
+    return bytes(cloudpickle.dumps(list(REGISTRATIONS.values())))
+
+
 def process_pool(n_workers: int) -> ProcessPool:
     """A pool of processes that have imported the libraries, and use one thread each."""
     forks = sys.platform not in ("win32", "darwin")  # where forked libraries crash
@@ -157,11 +169,11 @@ def process_pool(n_workers: int) -> ProcessPool:
     context.set_forkserver_preload(["rl_yardstick.experiments.preloaded"])
     for library in ("OMP", "MKL", "OPENBLAS"):  # small networks are slower with more
         os.environ[f"{library}_NUM_THREADS"] = "1"
-    return ProcessPool(n_workers, initializer=_follow_parent, context=context)
+    return ProcessPool(n_workers, initializer=_begin, initargs=(registrations(),), context=context)
 
 
-def _follow_parent() -> None:
-    """Let a worker end with the command that started it, also after a SIGKILL."""
+def _begin(own: bytes) -> None:
+    """Let a worker end with the command that started it, also after a SIGKILL; and register."""
     parent, leave = multiprocessing.parent_process(), os._exit
     assert parent is not None
     # The pool waits for ever for a process that ended with 0, as by os._exit in an environment.
@@ -172,14 +184,18 @@ def _follow_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+    for register in pickle.loads(own):  # noqa: S301  # of the parent process
+        register()
 
 
 def do_aside(function: Callable[..., Any], *args: Any) -> Any:
     """Call a function in a lasting process, so that this one need not import the libraries."""
-    return _aside().schedule(function, args=args).result()
+    return _aside(registrations()).schedule(function, args=args).result()
 
 
-_aside = cache(partial(process_pool, 1))
+@cache
+def _aside(own: bytes) -> ProcessPool:
+    return process_pool(1)
 
 
 # --- doing runs -----------------------------------------------------------------------------------
