@@ -1,7 +1,4 @@
-"""Tabular, bandit and deep reinforcement learning, measured against the exact optimum.
-
-The functions of ``import rl_yardstick as ys`` are in `rl_yardstick.api`, imported at first use.
-"""
+"""Reinforcement learning measured against the exact optimum; in Python, see `rl_yardstick.api`."""
 
 from importlib import import_module
 from typing import Any

@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands.cli import OneLineParser, flag, shared, whole_number, with_engine
-from rl_yardstick.diagnosis.faults import FAULTS, KINDS, Finding
+from rl_yardstick.diagnosis.faults import FAULTS, KINDS
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -66,7 +66,8 @@ def main() -> int:
     findings = []
     for finding in audit(subject, range(args.seeds)):
         findings.append(finding)
-        say(console, finding_line(finding))
+        reason = "" if finding.state in ("fault", "ok") else f": {finding.text}"
+        say(console, f"  {finding.probe:<36}{WORDS[finding.state]}{reason}")
     verdict = Verdict(subject.name, tuple(findings))
     for line in verdict_lines(verdict):
         say(console, line)
@@ -96,12 +97,6 @@ def subject_of(args: argparse.Namespace) -> Subject:
     if args.engine is not None:
         raise UserError("--engine: a script has none")
     return ScriptSubject(name, function, typed, args.kind, wanted)
-
-
-def finding_line(finding: Finding) -> str:
-    """The finding of a probe, in a line."""
-    reason = "" if finding.state in ("fault", "ok") else f": {finding.text}"
-    return f"  {finding.probe:<36}{WORDS[finding.state]}{reason}"
 
 
 def verdict_lines(verdict: Verdict) -> list[str]:

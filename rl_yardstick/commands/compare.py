@@ -184,21 +184,6 @@ def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> W
         raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'") from None
 
 
-def carry_out(job: Job, record: StudyRecord) -> int:
-    """Do a study, and judge it; return 0 if all runs are finished, else 1."""
-    looks = record.looks
-    results, said = finished(job, record)
-    code = conclude(job, results, looks)
-    if said is None:
-        return code
-    n_undecided = sum(pair.word == "undecided" for pair in said.pairs)
-    left = f"{n_undecided} pairs are undecided" if n_undecided else "all is decided"
-    n_runs = sum(sum(by.values()) for by in said.seeds.values())
-    design = f"{looks[-1]:,} seeds of each agent would be {looks[-1] * len(record.specs):,}"
-    job.console.print(f"{n_runs:,} runs, where {design}; {left}")
-    return code
-
-
 def finished(job: Job, record: StudyRecord) -> tuple[StudyResults, Study | None]:
     """Do the missing runs of a study; return the results of all, and the verdicts of a look."""
     from rl_yardstick.experiments.plan import plan
@@ -209,6 +194,20 @@ def finished(job: Job, record: StudyRecord) -> tuple[StudyResults, Study | None]
     if record.looks:
         return look_by_look(job, record)
     return do_study(job, record.study, planned), None
+
+
+def carry_out(job: Job, record: StudyRecord) -> int:
+    """Do a study, and judge it; return 0 if all runs are finished, else 1."""
+    (results, said), looks = finished(job, record), record.looks
+    code = conclude(job, results, looks)
+    if said is None:
+        return code
+    n_undecided = sum(pair.word == "undecided" for pair in said.pairs)
+    left = f"{n_undecided} pairs are undecided" if n_undecided else "all is decided"
+    n_runs = sum(sum(by.values()) for by in said.seeds.values())
+    design = f"{looks[-1]:,} seeds of each agent would be {looks[-1] * len(record.specs):,}"
+    job.console.print(f"{n_runs:,} runs, where {design}; {left}")
+    return code
 
 
 def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
@@ -290,27 +289,23 @@ def look_by_look(
 
 def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
     """Judge the finished runs, and say which are missing; return the exit code."""
-    if len(results.summary):
-        _judge(job, results, looks)
-    tell_notes(job.console, results)
-    return int(len(results.finished) < len(results.planned))
-
-
-def tell_notes(console: Console, results: StudyResults) -> None:
-    """Print what readers of the results should know, and which runs are left out."""
     from rl_yardstick.experiments.results import mixed_versions
 
-    records = {run.environment: run.recorded() for run in results.finished[::-1]}
-    for environment, record in records.items():
-        if refusal := record.get("model_refused"):
-            console.print(f"{environment}: {refusal}; figures are sampled")
-        for note in record.get("notes", ()):
-            console.print(f"{environment}: {note}")
-    if note := mixed_versions(run.recorded() for run in results.finished):
-        console.print(note)
+    tell = job.console.print
+    if len(results.summary):
+        _judge(job, results, looks)
+        records = {run.environment: run.recorded() for run in results.finished[::-1]}
+        for environment, record in records.items():
+            if refusal := record.get("model_refused"):
+                tell(f"{environment}: {refusal}; figures are sampled")
+            for note in record.get("notes", ()):
+                tell(f"{environment}: {note}")
+        if note := mixed_versions(run.recorded() for run in results.finished):
+            tell(note)
     for one in results.left_out:
         again = f"remove {one.planned.path} to do it again"
-        console.print(f"left out: {one.planned.title}: {one.reason}; {again}")
+        tell(f"left out: {one.planned.title}: {one.reason}; {again}")
+    return int(len(results.finished) < len(results.planned))
 
 
 def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
@@ -321,28 +316,18 @@ def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
     with console.status("judging the agents"):
         analysis = analyse(results, looks)
     job.stop.check()
+    from rl_yardstick.report.documents import write_tables, write_verdicts
     from rl_yardstick.report.terminal import print_analysis, print_episodes_table
 
     print_analysis(console, analysis)
     if failed := worst_failed_run(results):
         console.print(f"why the worst run failed: {cli.to_copy('explain', failed)}")
+    with console.status("writing the tables"):
+        files = [*write_tables(results), *write_verdicts(analysis, job.command)]
     if width:
         from rl_yardstick.report.series import episodes_table
 
         print_episodes_table(console, episodes_table(results, width), width)
-    files = written(job, analysis)
-    console.print(f"\nfiles: {results.root}")
-    for path in files:
-        console.print(f"  {path.relative_to(results.root)}")
-
-
-def written(job: Job, analysis: StudyAnalysis) -> list[Path]:
-    """Write tables, verdicts, films, figures and page; return the files."""
-    from rl_yardstick.report.documents import write_tables, write_verdicts
-
-    results, console = analysis.results, job.console
-    with console.status("writing the tables"):
-        files = [*write_tables(results), *write_verdicts(analysis, job.command)]
     if results.study.render_every:
         from rl_yardstick.report.films import write_films
 
@@ -351,7 +336,11 @@ def written(job: Job, analysis: StudyAnalysis) -> list[Path]:
         files += films
         for reason in refused:
             console.print(f"no film: {reason}")
-    return [*files, *(_draw(job, analysis) if job.with_page else ())]
+    if job.with_page:
+        files += _draw(job, analysis)
+    console.print(f"\nfiles: {results.root}")
+    for path in files:
+        console.print(f"  {path.relative_to(results.root)}")
 
 
 def _draw(job: Job, analysis: StudyAnalysis) -> list[Path]:

@@ -164,7 +164,7 @@ def main() -> int:
 
 
 def carry_out(job: Job, tuning: TuningSpec, deadline: float) -> int:
-    """Search until the ``deadline``, and re-test; return the exit code."""
+    """Search until the deadline, and re-test; return the exit code."""
     job.console.print(tuning.study.title, style="bold")
     with job.console.status("loading the libraries"):
         from rl_yardstick.tuning.searching import open_search

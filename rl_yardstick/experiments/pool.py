@@ -94,10 +94,13 @@ def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
     if stop is not None:
         yield stop
         return
-    of_driver = signal.getsignal(signal.SIGINT)
-    with Stop().listening() as own:
-        signal.signal(signal.SIGINT, of_driver)
-        yield own
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    stop = Stop().listen()
+    signal.signal(signal.SIGINT, before[signal.SIGINT])
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGTERM, before[signal.SIGTERM])
 
 
 # --- workers on this machine ----------------------------------------------------------------------
@@ -155,11 +158,9 @@ REGISTRATIONS: dict[str, Callable[[], object]] = {}
 
 def registrations() -> bytes:
     """The registrations, as cloudpickle copies code that stands in no module."""
-    if not REGISTRATIONS:
-        return pickle.dumps([])
     import cloudpickle
 
-    return bytes(cloudpickle.dumps(list(REGISTRATIONS.values())))
+    return bytes(cloudpickle.dumps([*REGISTRATIONS.values()]))
 
 
 def process_pool(n_workers: int) -> ProcessPool:

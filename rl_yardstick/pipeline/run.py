@@ -10,8 +10,8 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import FrameType
@@ -44,17 +44,6 @@ class Stop:
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, self._noticed)
         return self
-
-    @contextmanager
-    def listening(self) -> Iterator[Self]:
-        """Take over the signals until the ``with`` ends, in a process that goes on after it."""
-        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield self.listen()
-        finally:
-            if threading.current_thread() is threading.main_thread():
-                for number, handler in before.items():
-                    signal.signal(number, handler)
 
     def _noticed(self, number: int, frame: FrameType | None) -> None:
         if self.number:
