@@ -2,15 +2,13 @@
 
 - **Environments** are ids, objects, or a class or function that makes one. An object with a
   registered id stands for that id and its arguments; any other is copied.
-- **Agents** are names or classes.
+- **Agents** are names or classes. Either class may stand in a cell of a notebook.
 - **Settings** are flags of the command, with ``_`` in place of ``-``, and hyperparameters:
   ``n_timesteps=20_000`` is ``--n-timesteps 20000``, ``gamma=0.9`` is ``-params gamma:0.9``.
   ``folder`` is that of all runs; None makes a temporary one.
-- **Results** show themselves in a notebook.
 
-Classes may stand in a cell of a notebook; parallel workers get a copy. Each function raises
-`UserError`, with one line, for what does not exist or does not fit. An interrupt ends the work at
-the next safe moment with `KeyboardInterrupt`.
+Each function raises `UserError`, with one line, for what does not exist or does not fit. An
+interrupt ends the work at the next safe moment with `KeyboardInterrupt`.
 """
 
 from __future__ import annotations
@@ -50,7 +48,7 @@ from rl_yardstick.commands.cli import import_typed
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.diagnosis import audit as probes
 from rl_yardstick.diagnosis.explanation import explanation
-from rl_yardstick.experiments.plan import StudyRecord, plan_of_looks, specs_of
+from rl_yardstick.experiments.plan import StudyRecord, specs_of
 from rl_yardstick.experiments.pool import REGISTRATIONS
 from rl_yardstick.experiments.results import read_evaluations
 from rl_yardstick.experiments.study import file_name
@@ -98,7 +96,6 @@ class Run(Shown):
     """A run folder: the result of `train`, or ``Run(path)``.
 
     Attributes:
-        folder: its path.
         result: figures of the final policy (``mean_return``, ``score``, ``optimum``, ...), and
             ``run.json``.
         curve: mean returns of the evaluations in training: columns ``step`` and ``value``.
@@ -129,12 +126,10 @@ class Study(Shown):
     """A folder of a study: the result of `compare`, or ``Study(path)``.
 
     Attributes:
-        folder: its path.
         page: the path of its page; None with ``no_report=True``.
-        table: a row for each environment and agent: ``mean``, ``mean_interval`` (95 %), ``failed``
-            and others, of scores where they are known, else of the metric.
-        verdicts: a row for each pair of agents, as in ``verdicts.csv``.
-        runs: a row for each run, as in ``summary.csv``.
+        table: a row for each environment and agent: ``mean``, ``mean_interval`` (95 %), ... of
+            scores where they are known, else of the metric.
+        verdicts, runs: a row for each pair of agents, and for each run, as in the CSV files.
     """
 
     def __init__(self, folder: str | Path, text: str = "") -> None:
@@ -146,12 +141,9 @@ class Study(Shown):
         self.lines = (text or read_text(self.folder / "verdicts.md")).strip().splitlines()
 
 
-# --- the functions --------------------------------------------------------------------------------
-
-
 def train(env: Any, algo: str | type = "ppo", **settings: Any) -> Run:
     """Train an agent, as ``train.py``; after an interrupt, ``train.py --resume`` continues."""
-    args = _flags(train_command, [env], [algo], settings)
+    args = _flags(train_command, env, algo, settings)
     spec = train_command.spec_from_flags(args)
     with _at_work(args.verbose) as work, RunFolder.claim(Path(args.log_folder), spec) as run:
         run.console, run.stop = work
@@ -165,25 +157,22 @@ def train(env: Any, algo: str | type = "ppo", **settings: Any) -> Run:
 
 
 def compare(envs: Any, algos: Any, seeds: int = 10, **settings: Any) -> Study:
-    """Compare agents over seeds, as ``compare.py``, in parallel processes.
+    """Compare agents over seeds, as ``compare.py``; ``envs`` and ``algos`` are one or a list.
 
-    ``envs`` and ``algos`` are one or a list; settings hold for all agents. The same call again does
-    the missing runs alone. Other settings, or other code of your classes, make another folder,
-    unless ``name`` is given.
+    Runs are done in parallel. The same call again does the missing runs alone. Other settings, or other code of your classes,
+    make another folder, unless ``name`` is given.
     """
-    args = _flags(compare_command, _listed(envs), _listed(algos), {"seeds": seeds, **settings})
+    args = _flags(compare_command, envs, algos, {"seeds": seeds, **settings})
     study, text = compare_command.study_spec(args), StringIO()
     record, root = StudyRecord(study, specs_of(study)), Path(args.log_folder) / study.name
     workers = compare_command.workers_of(args, root, study.run_timeout)
     with _at_work() as work, compare_command.held(root), workers:
         job = compare_command.Job(root, args.command, *work, workers, not args.no_report)
-        if args.until_decided:
-            record = replace(record, looks=plan_of_looks(study, root, args.max_seeds))
         results, _ = compare_command.finished(job, record)
         if results.summary.empty:
             raise UserError(f"no run has finished: {next(iter(results.failures.values()), '')}")
-        job = replace(job, console=TextConsole(file=text, width=100, force_jupyter=False))
-        compare_command.conclude(job, results, record.looks)
+        printed = TextConsole(file=text, width=100, **_PLAIN)
+        compare_command.conclude(replace(job, console=printed), results, ())
     return Study(root, text.getvalue())
 
 
@@ -194,16 +183,19 @@ def explain(model: Any, env: Any = None, **env_kwargs: Any) -> Told:
     Returns ``return``, ``optimum``, ``gap``, ``parts``, ``states``, ``proposals``, ... by name.
     """
     env_id, kwargs = (None, {}) if env is None else _environment(env)
-    kwargs, algo, typed = {**kwargs, **env_kwargs}, None, list[str]()
+    algo, typed = None, list[str]()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.zip"
-        if isinstance(model, Run | str | Path):
-            path = model.folder if isinstance(model, Run) else Path(model)
-            typed = Run(path).spec.gym_packages if (path / "run.json").is_file() else typed
+        if isinstance(model, str | Path):
+            path = Path(model)
+        elif isinstance(model, Run):
+            path, typed = model.folder, model.spec.gym_packages
+        elif env_id is None:
+            raise UserError("explain(model, env): a model that is in no folder needs its env")
         else:
             algo = _agent(type(model), typed)
             model.save(path)
-        wanted = Wanted(path, algo, env_id, env_kwargs=kwargs, typed=typed)
+        wanted = Wanted(path, algo, env_id, env_kwargs=kwargs | env_kwargs, typed=typed)
         one = explain_command.asked(TextConsole(quiet=True), wanted)
     found = explanation(one.found.spec, one.agent, one.evaluator)
     return Told(found.as_data(), why_lines(found))
@@ -214,7 +206,7 @@ def audit(algo: str | type, **settings: Any) -> Told:
 
     Returns ``verdict``, ``fault``, ``faults`` and ``probes`` by name.
     """
-    args = _flags(audit_command, [], [algo], settings)
+    args = _flags(audit_command, [], algo, settings)
     subject = audit_command.subject_of(args)
     verdict = probes.Verdict(subject.name, (*probes.audit(subject, range(args.seeds)),))
     return Told(verdict.as_json(), [subject.name, *audit_command.verdict_lines(verdict)])
@@ -230,7 +222,7 @@ def optimum(env: Any, **env_kwargs: Any) -> Told:
     """
     env_id, kwargs = _environment(env)
     check_env_id(env_id)
-    entry = with_files_read(env_id, {"env_kwargs": {**kwargs, **env_kwargs}})
+    entry = with_files_read(env_id, {"env_kwargs": kwargs | env_kwargs})
     spec = validated({"algo": "optimal", "env_id": env_id, **entry})
     if (known := exact_evaluator(spec)) is None:
         raise UserError(model_refusal(spec) or f"the model of {env_id} is not known")
@@ -249,7 +241,7 @@ def tune(env: Any, algo: str | type, **settings: Any) -> Told:
     The same call again continues. Returns ``tuning.json`` by name, ``folder``, and ``conf_file``:
     the winner's settings for `train`, or None if the shipped settings stay.
     """
-    args = _flags(tune_command, [env], [algo], settings)
+    args = _flags(tune_command, env, algo, settings)
     tuning, deadline = tune_command.tuning_spec(args), time.monotonic() + args.timeout
     root = Path(args.log_folder) / tuning.study.name
     workers = compare_command.workers_of(args, root, tuning.study.run_timeout)
@@ -266,13 +258,15 @@ def tune(env: Any, algo: str | type, **settings: Any) -> Told:
 # Flags that are no settings in Python; some hyperparameters have their names.
 _NONE = {"help", "h", "list", "resume", "resume_or_start", "env", "algo", "algos", "params"}
 _NONE |= {"hyperparams", "policy", "logged", "columns", "cluster", "script", "json", "f"}
-# Settings that change no result of a run.
-_BESIDE = {"folder", "seeds", "first_seed", "jobs", "no_report", "until_decided", "max_seeds"}
+_NONE |= {"until_decided", "max_seeds"}
+_BESIDE = {"folder", "seeds", "first_seed", "jobs", "no_report"}  # these change no run
+_PLAIN: Any = {"force_jupyter": False, "force_terminal": False}
 
 
 def _flags(command: Any, envs: Any, algos: Any, settings: Mapping[str, Any]) -> Any:
     """A command's flags from keywords; a keyword that is no flag is a hyperparameter."""
     parser, packages, params = command.build_parser(), list[str](), dict[str, Any]()
+    envs, algos = (one if isinstance(one, list | tuple) else [one] for one in (envs, algos))
     flags = {name.lstrip("-").replace("-", "_"): name for name in parser._option_string_actions}
     made, given = (
         [_environment(env, len(envs) == 1) for env in envs],
@@ -291,7 +285,8 @@ def _flags(command: Any, envs: Any, algos: Any, settings: Mapping[str, Any]) -> 
         elif isinstance(value, Mapping):
             words += [flags[key], *_assignments(value)] if value else []
         elif value is not None and value is not False:
-            words += [flags[key], *(map(str, _listed(value)) if value is not True else ())]
+            several = value if isinstance(value, list | tuple) else [value][value is True :]
+            words += [flags[key], *map(str, several)]
     words += ["-params", *_assignments(params)] if params else []
     args = parser.parse_args(words)
     args.command = shlex.join(["yardstick", command.__name__.rpartition(".")[2], *words])
@@ -307,10 +302,6 @@ def _assignments(values: Mapping[str, Any]) -> list[str]:
     """``name:literal`` words; classes by their names, such as ``torch.nn.Tanh``."""
     texts = json.dumps(dict(values), default=lambda one: f"{one.__module__}.{one.__qualname__}")
     return [f"{key}:{value!r}" for key, value in json.loads(texts).items()]
-
-
-def _listed(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, list | tuple) else [value]
 
 
 def _name(names: Sequence[str], made: Sequence[Any], settings: Mapping[str, Any]) -> str | None:
@@ -340,8 +331,7 @@ def _environment(given: Any, is_alone: bool = True) -> tuple[str, dict[str, Any]
         if is_alone or not own:
             return spec.id, own
     if not (is_object or callable(given)):
-        form = "an id, a gymnasium.Env, or a class or function that makes one"
-        raise UserError(f"an environment is {form}, not {shown(given)}")
+        raise UserError(f"an environment is an id, an object or a class, not {shown(given)}")
     for known in gym.registry.values():
         if given in (known.entry_point, *getattr(known.entry_point, "args", ())):
             return known.id, {}
@@ -358,6 +348,8 @@ def _agent(algo: str | type, packages: list[str]) -> str:
     """The name of an agent; a class of the user gets one, and its module is one of ``packages``."""
     if isinstance(algo, str):
         return algo
+    if not isinstance(algo, type):
+        raise UserError(f"an agent is a name or a class, not {shown(algo)}")
     module, name = algo.__module__, algo.__qualname__
     if module.partition(".")[0] in ("rl_yardstick", "stable_baselines3", "sb3_contrib"):
         known = (
@@ -384,14 +376,14 @@ def _agent(algo: str | type, packages: list[str]) -> str:
 def _at_work(verbose: int = 1) -> Iterator[tuple[TextConsole, Stop]]:
     """A console, and a request to stop that an interrupt sets."""
     # Without ipywidgets a notebook shows lines in place of a bar.
-    in_notebook = None if find_spec("ipywidgets") else False
+    options = _PLAIN if "ipykernel" in sys.modules and not find_spec("ipywidgets") else {}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     # Workers would import the script that started them, and begin it once more.
     main = vars(sys.modules["__main__"])
     hidden: dict[str, Any] = {name: main.pop(name, None) for name in ("__file__", "__spec__")}
     main["__spec__"] = None
     try:
-        yield TextConsole(quiet=verbose < 1, force_jupyter=in_notebook), Stop().listen()
+        yield TextConsole(quiet=verbose < 1, **options), Stop().listen()
     except Stopped:
         raise KeyboardInterrupt("stopped at a safe moment") from None
     finally:

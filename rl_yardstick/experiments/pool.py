@@ -151,8 +151,7 @@ class Workers:
             self._pool = None
 
 
-#: What each worker calls first, by name: it registers the user's classes and environments, which
-#: may stand in a cell of a notebook.
+#: What workers call first: it registers the user's classes and environments, as from a notebook.
 REGISTRATIONS: dict[str, Callable[[], object]] = {}
 
 
