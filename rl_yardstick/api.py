@@ -159,7 +159,7 @@ def train(env: Any, algo: str | type = "ppo", **settings: Any) -> Run:
 def compare(envs: Any, algos: Any, seeds: int = 10, **settings: Any) -> Study:
     """Compare agents over seeds, as ``compare.py``; ``envs`` and ``algos`` are one or a list.
 
-    Runs are done in parallel. The same call again does the missing runs alone. Other settings, or other code of your classes,
+    The same call again does the missing runs alone. Other settings, or other code of your classes,
     make another folder, unless ``name`` is given.
     """
     args = _flags(compare_command, envs, algos, {"seeds": seeds, **settings})
@@ -215,10 +215,9 @@ def audit(algo: str | type, **settings: Any) -> Told:
 def optimum(env: Any, **env_kwargs: Any) -> Told:
     """The highest expected return under the time limit, where the environment's model is known.
 
-    Returns by name: ``optimum`` (a return, undiscounted), ``baseline`` (of the best random or
-    constant policy), ``horizon`` (the time limit in steps), ``values`` (the highest expected return
-    from each state on, shape (S,)), ``actions`` (which are optimal, with all steps left, bool of
-    shape (S, A)) and ``policy`` (an optimal action at each step, shape (horizon, S)).
+    Returns by name: undiscounted returns ``optimum`` and ``baseline`` (of the best random or
+    constant policy), ``horizon`` (steps), ``values`` (shape (S,)), ``actions`` (those optimal with
+    all steps left, bool (S, A)), ``policy`` (an optimal action at each step, (horizon, S)).
     """
     env_id, kwargs = _environment(env)
     check_env_id(env_id)
@@ -253,12 +252,9 @@ def tune(env: Any, algo: str | type, **settings: Any) -> Told:
     return Told({**read_json(root / "tuning.json"), "folder": root, "conf_file": winner}, lines)
 
 
-# --- settings, environments and agents ------------------------------------------------------------
-
 # Flags that are no settings in Python; some hyperparameters have their names.
-_NONE = {"help", "h", "list", "resume", "resume_or_start", "env", "algo", "algos", "params"}
-_NONE |= {"hyperparams", "policy", "logged", "columns", "cluster", "script", "json", "f"}
-_NONE |= {"until_decided", "max_seeds"}
+_NONE = {"help", "list", "resume", "resume_or_start", "env", "algo", "algos", "params", "columns"}
+_NONE |= {"hyperparams", "policy", "logged", "cluster", "until_decided", "max_seeds"}
 _BESIDE = {"folder", "seeds", "first_seed", "jobs", "no_report"}  # these change no run
 _PLAIN: Any = {"force_jupyter": False, "force_terminal": False}
 
@@ -268,13 +264,10 @@ def _flags(command: Any, envs: Any, algos: Any, settings: Mapping[str, Any]) -> 
     parser, packages, params = command.build_parser(), list[str](), dict[str, Any]()
     envs, algos = (one if isinstance(one, list | tuple) else [one] for one in (envs, algos))
     flags = {name.lstrip("-").replace("-", "_"): name for name in parser._option_string_actions}
-    made, given = (
-        [_environment(env, len(envs) == 1) for env in envs],
-        {"env_kwargs": {}, **settings},
-    )
+    made, given = [_environment(env, len(envs) == 1) for env in envs], {**settings}
     ids, names = [env_id for env_id, _ in made], [_agent(algo, packages) for algo in algos]
-    for _, kwargs in made:
-        given["env_kwargs"] = kwargs | given["env_kwargs"]
+    if made and made[0][1]:
+        given["env_kwargs"] = made[0][1] | given.get("env_kwargs", {})
     if "folder" in given:
         given["log_folder"] = given.pop("folder") or tempfile.mkdtemp(prefix="yardstick-")
     words = ["--env", *ids] if ids else []
@@ -283,7 +276,7 @@ def _flags(command: Any, envs: Any, algos: Any, settings: Mapping[str, Any]) -> 
         if key not in flags or key in _NONE:
             params[key] = value
         elif isinstance(value, Mapping):
-            words += [flags[key], *_assignments(value)] if value else []
+            words += [flags[key], *_assignments(value)]
         elif value is not None and value is not False:
             several = value if isinstance(value, list | tuple) else [value][value is True :]
             words += [flags[key], *map(str, several)]
@@ -346,16 +339,12 @@ def _environment(given: Any, is_alone: bool = True) -> tuple[str, dict[str, Any]
 
 def _agent(algo: str | type, packages: list[str]) -> str:
     """The name of an agent; a class of the user gets one, and its module is one of ``packages``."""
-    if isinstance(algo, str):
-        return algo
     if not isinstance(algo, type):
-        raise UserError(f"an agent is a name or a class, not {shown(algo)}")
+        return str(algo)
     module, name = algo.__module__, algo.__qualname__
     if module.partition(".")[0] in ("rl_yardstick", "stable_baselines3", "sb3_contrib"):
-        known = (
-            key for key, one in agents.ALGORITHMS.items() if one.entry_point.endswith(f":{name}")
-        )
-        return next(known, name)
+        own = [k for k, one in agents.ALGORITHMS.items() if one.entry_point.endswith(f":{name}")]
+        return own[0] if own else name
     if getattr(sys.modules.get(module), name, None) is not algo:
         raise UserError(f"{name}: define the class at the top of its module or cell")
     register: Any = partial(agents.register, name, f"{module}:{name}")
