@@ -24,8 +24,6 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 
 class Line(gym.Env):
-    """Two states and a goal."""
-
     observation_space, action_space = gym.spaces.Discrete(3), gym.spaces.Discrete(2)
 
     def reset(self, *, seed=None, options=None):
@@ -62,8 +60,7 @@ def test_names_are_listed_and_nothing_is_imported_for_them():
     code = "import rl_yardstick as ys, sys; print(*ys.__all__, len(sys.modules)); ys.nothing"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     *names, n_modules = done.stdout.split()
-    assert {*names} == {*ys.__all__} <= {*dir(ys)}
-    assert int(n_modules) < 100
+    assert {*names} == {*ys.__all__} <= {*dir(ys)} and int(n_modules) < 100  # noqa: PT018
     assert done.stderr.splitlines()[-1].startswith("AttributeError: module 'rl_yardstick' has no")
 
 
@@ -77,7 +74,6 @@ def test_a_run_is_the_command_s(run, typed):
     assert run.curve.equals(other.curve) and len(run.curve) == 20  # noqa: PT018
     assert (run.model.policy.q_table == other.model.policy.q_table).all()
     assert run.png == run._repr_png_() == (run.folder / "value_map.png").read_bytes()
-    assert f"{run.result['optimum']:.6g}" in run._repr_html_()
     assert "data:image/png;base64," in run._repr_html_()
 
 
@@ -107,9 +103,7 @@ def test_an_explanation_is_of_a_run_a_path_or_a_model(run):
         (lambda: ys.explain(Line()), "needs its env"),
         (lambda: ys.optimum("CartPole-v1"), "the model of CartPole-v1 is not known"),
         (lambda: ys.Run("nowhere"), "nowhere is no run folder"),
-        (lambda: ys.Study("nowhere"), "no such file"),
         (lambda: ys.audit("ucb"), "it is for bandits"),
-        (lambda: ys.tune("FrozenLake-v1", "ppo", retest_seeds=0), "--retest-seeds: must"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(call, words, tmp_path):
@@ -122,12 +116,10 @@ def test_mistakes_are_one_line_and_leave_nothing(call, words, tmp_path):
 
 def test_settings_are_flags_and_hyperparameters():
     settings = {"n_timesteps": 500, "eval_freq": 100, "learning_rate": "lin_0.5", "gamma": 0.5}
-    args = api._flags(ys.api.train_command, "FrozenLake-v1", "qlearning", settings)
-    spec = spec_from_flags(args)
-    assert (spec.n_timesteps, spec.eval_freq, spec.algorithm["gamma"]) == (500, 100, 0.5)
-    assert spec.algorithm["learning_rate"] == "lin_0.5"
+    spec = spec_from_flags(api._flags(api.train_command, "FrozenLake-v1", "qlearning", settings))
+    assert {**vars(spec), **spec.algorithm}.items() >= settings.items()
     words = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [4], "activation_fn": DQN}}
-    args = api._flags(ys.api.compare_command, "CartPole-v1", "dqn", words)
+    args = api._flags(api.compare_command, "CartPole-v1", "dqn", words)
     assert args.policy == []
     named = "{'net_arch': [4], 'activation_fn': 'stable_baselines3.dqn.dqn.DQN'}"
     assert f"policy_kwargs:{named}" in args.hyperparams
@@ -139,7 +131,6 @@ def test_environments_without_an_id_get_one():
         env_id, kwargs = api._environment(given)
         assert api._environment(given) == (env_id, kwargs) == (env_id, {})
         assert gym.make(env_id).unwrapped is not made
-    assert gym.make(api._environment(wrapped)[0]).get_wrapper_attr("func")(1) == 2
     dry = gym.make("FrozenLake-v1", is_slippery=False, render_mode="rgb_array")
     assert api._environment(dry) == ("FrozenLake-v1", {"is_slippery": False})
     short = gym.make("CliffWalking-v1", max_episode_steps=9)
@@ -148,11 +139,8 @@ def test_environments_without_an_id_get_one():
 
 
 def test_own_classes_are_named_and_their_code_names_the_study(monkeypatch):
-    assert [api._agent(one, []) for one in (DQN, agents.load_algorithm("sarsa"))] == [
-        "dqn",
-        "sarsa",
-    ]
-    packages = []
+    packages, known = [], (DQN, agents.load_algorithm("sarsa"))
+    assert [api._agent(one, packages) for one in known] == ["dqn", "sarsa"]
     assert api._agent(Learner, packages) == "Learner"
     assert packages == [Learner.__module__]
     names = [api._name(["a"], [Line], {"jobs": n, "gamma": g}) for n, g in ((1, 0), (2, 0), (1, 1))]
@@ -180,12 +168,10 @@ print(study._repr_html_()[:5], ys.Study(study.folder).table.equals(study.table))
 def test_classes_of_a_script_train_in_parallel(tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    words = [sys.executable, "script.py"]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
-    lines = done.stdout.splitlines()
-    assert lines.count("begun") == 1
-    assert lines[-2].startswith("4 Chance random None ")
-    assert lines[-1] == "<pre> True"
+    printed = subprocess.check_output([sys.executable, "script.py"], env=environment, text=True)
+    assert printed.count("begun") == 1
+    assert "\n4 Chance random None " in printed
+    assert printed.endswith("<pre> True\n")
 
 
 def test_an_interrupt_ends_at_a_safe_moment_and_leaves_no_handler():
@@ -206,11 +192,9 @@ def test_notebooks_have_the_outputs_that_they_show(path, tmp_path):
     shown, made = nbformat.read(path, 4), nbformat.read(path, 4)
     if any(cell.get("outputs") for cell in shown.cells):
         NotebookClient(made, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    assert results(made) == results(shown)
-
-
-def results(notebook):
-    """The results without studies, which tell times."""
-    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
-    texts = [one.data["text/plain"] for one in outputs if one.output_type == "execute_result"]
-    return [text for text in texts if "Processor time" not in text]
+    texts = [
+        [output.data["text/plain"] for output in cell.get("outputs", ()) if "data" in output]
+        for cell in (*shown.cells, *made.cells)
+        if "Processor time" not in str(cell.get("outputs"))
+    ]
+    assert texts[: len(texts) // 2] == texts[len(texts) // 2 :]
