@@ -44,6 +44,7 @@ ConnectionFileMixin.curve_secretkey.default_value = secret_key
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300  # of a cell, on a busy machine that has compiled nothing yet
+nb_execution_excludepatterns = ["*.ipynb"]  # tests run them; the site shows their own outputs
 nb_merge_streams = True
 nb_render_markdown_format = "myst"  # it has tables
 

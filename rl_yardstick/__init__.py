@@ -1,1 +1,18 @@
-"""Tabular, bandit and deep reinforcement learning, measured against the exact optimum."""
+"""Reinforcement learning measured against the exact optimum; in Python, see `rl_yardstick.api`."""
+
+from importlib import import_module
+from typing import Any
+
+_OF_API = ("Run", "Study", "audit", "compare", "explain", "optimum", "train", "tune")
+_HOMES = dict.fromkeys(_OF_API, "api") | {"judge": "experiments.others", "rate": "rating"}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

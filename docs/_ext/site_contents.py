@@ -11,7 +11,10 @@ from sphinx.application import Sphinx
 FOLDERS = {"algorithms": "algorithms/", "environments": "environments/", "lessons/index": "0"}
 # Pages that the navigation shows below another.
 BELOW = {
-    "training": ["run-folder", "watching", "masks", "model-files", "cluster"],
+    "training": ["python", "run-folder", "watching", "masks", "model-files", "cluster"],
+    "python": [
+        f"notebooks/{one}" for one in ("quick-start", "my-agent-against-ppo", "rate-my-q-table")
+    ],
     "compare": ["statistics", "library-vs-hand-rolled", "why-better"],
     "explain": ["critics", "audit", "shaping"],
     "environments": ["partial-observability"],

@@ -61,7 +61,7 @@ def main() -> int:
         import torch as th
 
         th.set_num_threads(1)  # networks as small as these are slower with two
-        subject = _subject(args)
+        subject = subject_of(args)
         from rl_yardstick.diagnosis.audit import Verdict, audit
     say(console, f"audit of {subject.name}")
     findings = []
@@ -77,7 +77,7 @@ def main() -> int:
     return verdict.exit_code
 
 
-def _subject(args: argparse.Namespace) -> Subject:
+def subject_of(args: argparse.Namespace) -> Subject:
     """The algorithm that the arguments select; imports its module."""
     from rl_yardstick.pipeline.settings import check_agent, parse_assignments
 

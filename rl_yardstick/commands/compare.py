@@ -236,18 +236,24 @@ def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> W
         raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'") from None
 
 
-def carry_out(job: Job, record: StudyRecord) -> int:
-    """Do a study, and judge it; return 0 if all runs are finished, else 1."""
+def finished(job: Job, record: StudyRecord) -> tuple[StudyResults, Study | None]:
+    """Do the missing runs of a study; return the results of all, and the verdicts of a look."""
     from rl_yardstick.experiments.plan import plan
 
-    study, looks = record.study, record.looks
-    planned = plan(study, job.root, specs=record.specs)
+    planned = plan(record.study, job.root, specs=record.specs)
     check_settings_kept(job.root, planned)
     record.write(job.root)
-    if not looks:
-        return conclude(job, do_study(job, study, planned), ())
-    results, said = look_by_look(job, record)
+    if record.looks:
+        return look_by_look(job, record)
+    return do_study(job, record.study, planned), None
+
+
+def carry_out(job: Job, record: StudyRecord) -> int:
+    """Do a study, and judge it; return 0 if all runs are finished, else 1."""
+    (results, said), looks = finished(job, record), record.looks
     code = conclude(job, results, looks)
+    if said is None:
+        return code
     n_undecided = sum(pair.word == "undecided" for pair in said.pairs)
     left = f"{n_undecided} pairs are undecided" if n_undecided else "all is decided"
     n_runs = sum(sum(by.values()) for by in said.seeds.values())

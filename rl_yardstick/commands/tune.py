@@ -160,11 +160,16 @@ def main() -> int:
     root = Path(args.log_folder) / tuning.study.name
     workers = compare.workers_of(args, root, tuning.study.run_timeout)
     job = Job(root, cli.command_line(), table_console(), stop, workers, not args.no_report)
+    return carry_out(job, tuning, deadline)
+
+
+def carry_out(job: Job, tuning: TuningSpec, deadline: float) -> int:
+    """Search until the deadline, and re-test; return the exit code."""
     job.console.print(tuning.study.title, style="bold")
     with job.console.status("loading the libraries"):
         from rl_yardstick.tuning.searching import open_search
-    with held(root), workers:
-        search = open_search(tuning, root)
+    with held(job.root), job.workers:
+        search = open_search(tuning, job.root)
         search.deadline = deadline
         print_opened(job, search)
         try:

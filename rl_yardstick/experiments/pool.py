@@ -14,12 +14,11 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any, Self
 
-import cloudpickle
 from pebble import ProcessExpired, ProcessPool
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -153,6 +152,18 @@ class Workers:
             self._pool = None
 
 
+#: What workers call first, after they know the user's classes: it registers environments.
+REGISTRATIONS: dict[str, Callable[[], object]] = {}
+
+
+def registrations() -> bytes:
+    """The registrations, as cloudpickle copies code that stands in no module."""
+    import cloudpickle
+
+    classes = [partial(name_of, cls) for cls in BY_VALUE.values()]
+    return bytes(cloudpickle.dumps([*classes, *REGISTRATIONS.values()]))
+
+
 def process_pool(n_workers: int) -> ProcessPool:
     """A pool of processes that have imported the libraries, and use one thread each."""
     forks = sys.platform not in ("win32", "darwin")  # where forked libraries crash
@@ -160,14 +171,11 @@ def process_pool(n_workers: int) -> ProcessPool:
     context.set_forkserver_preload(["rl_yardstick.experiments.preloaded"])
     for library in ("OMP", "MKL", "OPENBLAS"):  # small networks are slower with more
         os.environ[f"{library}_NUM_THREADS"] = "1"
-    classes = (cloudpickle.dumps(BY_VALUE),)
-    return ProcessPool(n_workers, initializer=_start, initargs=classes, context=context)
+    return ProcessPool(n_workers, initializer=_begin, initargs=(registrations(),), context=context)
 
 
-def _start(classes: bytes) -> None:
-    """Let a worker know the user's classes, and end with its command, also after a SIGKILL."""
-    for cls in pickle.loads(classes).values():  # noqa: S301  # from the command's memory
-        name_of(cls)
+def _begin(own: bytes) -> None:
+    """Let a worker end with the command that started it, also after a SIGKILL; and register."""
     parent, leave = multiprocessing.parent_process(), os._exit
     assert parent is not None
     # The pool waits for ever for a process that ended with 0, as by os._exit in an environment.
@@ -178,14 +186,18 @@ def _start(classes: bytes) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+    for register in pickle.loads(own):  # noqa: S301  # of the parent process
+        register()
 
 
 def do_aside(function: Callable[..., Any], *args: Any) -> Any:
     """Call a function in a lasting process, so that this one need not import the libraries."""
-    return _aside(*BY_VALUE.values()).schedule(function, args=args).result()
+    return _aside(registrations()).schedule(function, args=args).result()
 
 
-_aside = cache(lambda *classes: process_pool(1))
+@cache
+def _aside(own: bytes) -> ProcessPool:
+    return process_pool(1)
 
 
 # --- doing runs -----------------------------------------------------------------------------------

@@ -38,6 +38,10 @@ class UserError(Exception):
         self.example = example
         super().__init__(visible(" ".join(line.strip() for line in message.splitlines())))
 
+    def _render_traceback_(self) -> list[str]:
+        """What a notebook shows of it: the line, without a traceback."""
+        return [f"error: {self}"]
+
 
 class Stopped(Exception):  # noqa: N818  # no error
     """A signal, whose number it has, has ended the work at a safe moment."""

@@ -86,7 +86,7 @@ class TableReader(Reader):
     dispatch: ClassVar[dict[int, Any]] = dict(Reader.dispatch)
 
     def load_filled_dictionary(self) -> None:
-        items = self.pop_mark()  # type: ignore[attr-defined]
+        items = self.pop_mark()
         self.append(Made(DICTIONARY, (), items=items))
 
     dispatch[pickle.DICT[0]] = load_filled_dictionary

@@ -1,0 +1,200 @@
+"""The commands as Python functions: the same results, own classes, notebooks."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import nbformat
+import pytest
+from gymnasium.wrappers import TransformReward
+from nbclient import NotebookClient
+from stable_baselines3 import DQN
+
+import rl_yardstick as ys
+from rl_yardstick import agents, api
+from rl_yardstick.commands.train import spec_from_flags
+from rl_yardstick.experiments.pool import REGISTRATIONS
+from rl_yardstick.pipeline.errors import UserError
+
+ROOT = Path(__file__).parent.parent
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+
+
+class Line(gym.Env):
+    observation_space, action_space = gym.spaces.Discrete(3), gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = 0
+        return 0, {}
+
+    def step(self, action):
+        self.state += int(action)
+        return self.state, float(action), self.state == 2, False, {}
+
+
+class Learner(agents.load_algorithm("random")):
+    """An agent of this module."""
+
+
+@pytest.fixture(autouse=True)
+def own_registrations(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    tables = [(table, dict(table)) for table in (agents.ALGORITHMS, gym.registry, REGISTRATIONS)]
+    yield
+    for table, before in tables:
+        for name in table.keys() - before.keys():
+            del table[name]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    logs = tmp_path_factory.mktemp("logs")
+    return ys.train("FrozenLake-v1", "qlearning", n_timesteps=2000, seed=0, folder=logs)
+
+
+def test_names_are_listed_and_nothing_is_imported_for_them():
+    code = "import rl_yardstick as ys, sys; print(*ys.__all__, len(sys.modules)); ys.nothing"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    *names, n_modules = done.stdout.split()
+    assert {*names} == {*ys.__all__} <= {*dir(ys)} and int(n_modules) < 100  # noqa: PT018
+    assert done.stderr.splitlines()[-1].startswith("AttributeError: module 'rl_yardstick' has no")
+
+
+def test_a_run_is_the_command_s(run, typed):
+    words = "--env FrozenLake-v1 --algo qlearning -n 2000 --seed 0 -f there".split()  # noqa: SIM905
+    code, _, err = typed("train.py", *words)
+    assert (code, err) == (0, "")
+    other = ys.Run("there/qlearning/FrozenLake-v1_1")
+    names = ("mean_return", "score", "optimum", "n_timesteps", "best_mean_return")
+    assert [run.result[name] for name in names] == [other.result[name] for name in names]
+    assert run.curve.equals(other.curve) and len(run.curve) == 20  # noqa: PT018
+    assert (run.model.policy.q_table == other.model.policy.q_table).all()
+    assert run.png == run._repr_png_() == (run.folder / "value_map.png").read_bytes()
+    assert "data:image/png;base64," in run._repr_html_()
+
+
+def test_the_optimum_is_that_of_the_arguments():
+    dry = ys.optimum(gym.make("FrozenLake-v1", is_slippery=False, max_episode_steps=50))
+    assert (dry["optimum"], dry["horizon"], dry["values"][0]) == (1, 50, 1)
+    assert [dry[name].shape for name in ("policy", "actions")] == [(50, 16), (16, 4)]
+    assert ys.optimum("FrozenLake-v1", is_slippery=False, max_episode_steps=5)["optimum"] == 0
+
+
+def test_an_explanation_is_of_a_run_a_path_or_a_model(run):
+    found = [ys.explain(one) for one in (run, run.folder, str(run.folder))]
+    for each in (*found, ys.explain(run.model, "FrozenLake-v1")):
+        assert each["return"] == run.result["mean_return"]
+        assert each.lines == found[0].lines
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: ys.train("FrozenLake-v1", "qlearnin"), "did you mean 'qlearning'?"),
+        (lambda: ys.train("FrozenLake-v1", "qlearning", gama=1), "did you mean 'gamma'?"),
+        (lambda: ys.train("FrozenLake-v1", "qlearning", seed=-3), "--seed: must be a whole number"),
+        (lambda: ys.train(3), "an environment is an id, an object or a class, not 3"),
+        (lambda: ys.compare("FrozenLake-v1", "ppo", 0), "--seeds: must be a whole number"),
+        (lambda: ys.compare("FrozenLake-v1", "ppo", n=1, sed=1), "no hyperparameter 'sed'"),
+        (lambda: ys.explain(Line()), "needs its env"),
+        (lambda: ys.optimum("CartPole-v1"), "the model of CartPole-v1 is not known"),
+        (lambda: ys.Run("nowhere"), "nowhere is no run folder"),
+        (lambda: ys.audit("ucb"), "it is for bandits"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(call, words, tmp_path):
+    with pytest.raises(UserError) as error:
+        call()
+    assert words in str(error.value)
+    assert error.value._render_traceback_() == [f"error: {error.value}"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_settings_are_flags_and_hyperparameters():
+    settings = {"n_timesteps": 500, "eval_freq": 100, "learning_rate": "lin_0.5", "gamma": 0.5}
+    spec = spec_from_flags(api._flags(api.train_command, "FrozenLake-v1", "qlearning", settings))
+    assert {**vars(spec), **spec.algorithm}.items() >= settings.items()
+    words = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [4], "activation_fn": DQN}}
+    args = api._flags(api.compare_command, "CartPole-v1", "dqn", words)
+    assert args.policy == []
+    named = "{'net_arch': [4], 'activation_fn': 'stable_baselines3.dqn.dqn.DQN'}"
+    assert f"policy_kwargs:{named}" in args.hyperparams
+
+
+def test_environments_without_an_id_get_one():
+    made, wrapped = Line(), TransformReward(gym.make("FrozenLake-v1"), lambda reward: 2 * reward)
+    for given in (Line, made, wrapped, lambda size=1: Line()):
+        env_id, kwargs = api._environment(given)
+        assert api._environment(given) == (env_id, kwargs) == (env_id, {})
+        assert gym.make(env_id).unwrapped is not made
+    dry = gym.make("FrozenLake-v1", is_slippery=False, render_mode="rgb_array")
+    assert api._environment(dry) == ("FrozenLake-v1", {"is_slippery": False})
+    short = gym.make("CliffWalking-v1", max_episode_steps=9)
+    assert api._environment(short) == ("CliffWalking-v1", {"max_episode_steps": 9})
+    assert api._environment(short, is_alone=False) == ("CliffWalkingEnv-v0", {})
+
+
+def test_own_classes_are_named_and_their_code_names_the_study(monkeypatch):
+    packages, known = [], (DQN, agents.load_algorithm("sarsa"))
+    assert [api._agent(one, packages) for one in known] == ["dqn", "sarsa"]
+    assert api._agent(Learner, packages) == "Learner"
+    assert packages == [Learner.__module__]
+    names = [api._name(["a"], [Line], {"jobs": n, "gamma": g}) for n, g in ((1, 0), (2, 0), (1, 1))]
+    assert names[0] == names[1] != names[2]
+    monkeypatch.setattr(Line, "step", lambda self, action: None)
+    assert api._name(["a"], [Line], {"gamma": 0}) not in names
+    assert api._name(["a"], ["FrozenLake-v1"], {"jobs": 2}) is None
+
+
+# A script without a guard, as people write it: its classes are copied to two workers.
+SCRIPT = """
+import rl_yardstick as ys
+from tests.test_api import Line
+from rl_yardstick.agents.planning import RandomAgent
+
+class Mine(Line): pass
+class Chance(RandomAgent): pass
+print("begun")
+study = ys.compare(Mine, [Chance, "random"], 2, n_timesteps=20, jobs=2, no_report=True)
+print(len(study.runs), *study.table["name"], study.page, *study.verdicts["verdict"])
+print(study._repr_html_()[:5], ys.Study(study.folder).table.equals(study.table))
+"""
+
+
+def test_classes_of_a_script_train_in_parallel(tmp_path):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    printed = subprocess.check_output([sys.executable, "script.py"], env=environment, text=True)
+    assert printed.count("begun") == 1
+    assert "\n4 Chance random None " in printed
+    assert printed.endswith("<pre> True\n")
+
+
+def test_an_interrupt_ends_at_a_safe_moment_and_leaves_no_handler():
+    def interrupted():
+        with api._at_work() as (_, stop):
+            signal.raise_signal(signal.SIGINT)
+            stop.check()
+
+    before = signal.getsignal(signal.SIGINT), sys.modules["__main__"].__file__
+    with pytest.raises(KeyboardInterrupt, match="stopped at a safe moment"):
+        interrupted()
+    assert before == (signal.getsignal(signal.SIGINT), sys.modules["__main__"].__file__)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_have_the_outputs_that_they_show(path, tmp_path):
+    """Those without outputs wait for a function that is not there yet."""
+    shown, made = nbformat.read(path, 4), nbformat.read(path, 4)
+    if any(cell.get("outputs") for cell in shown.cells):
+        NotebookClient(made, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    texts = [
+        [output.data["text/plain"] for output in cell.get("outputs", ()) if "data" in output]
+        for cell in (*shown.cells, *made.cells)
+        if "Processor time" not in str(cell.get("outputs"))
+    ]
+    assert texts[: len(texts) // 2] == texts[len(texts) // 2 :]
