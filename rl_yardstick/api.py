@@ -104,7 +104,7 @@ class Run(Shown):
         self.folder, self._run = Path(folder), RunFolder(Path(folder))
         self.spec, found = self._run.spec(), self._run.recorded()
         self.result: dict[str, Any] = {**(found.get("final") or {}), **found}
-        steps, values = read_evaluations(self.folder)
+        steps, values = read_evaluations(self.folder / "evaluations.npz")
         self.curve = pd.DataFrame({"step": steps, "value": values})
         names = ("score", "mean_return", "optimum", "success_rate", "regret", "n_timesteps")
         told = [
