@@ -58,11 +58,12 @@ class Command:
         """
         words = list(self.words)
         needs = {"--list", "--resume", "-i", "--gym-packages", "--conf-file", "--logged"}
-        needs |= {"--as-it-comes"}
-        if needs & set(words) or "--env" not in words:
+        needs |= {"--as-it-comes", "--storage"}
+        agents = _values(words, "--algo") + _values(words, "--algos")
+        is_own = any(":" in agent for agent in agents)
+        if is_own or needs & set(words) or "--env" not in words:
             return []
         rest = _without(words, {**OUTPUT, **SEARCH, **STUDY, "--algo": 1})
-        agents = _values(words, "--algo") + _values(words, "--algos")
         pairs = product(_values(words, "--env"), agents)
         return [shlex.join(["--env", env, "--algo", algo, *rest]) for env, algo in pairs]
 

@@ -82,7 +82,7 @@ def subject_of(args: argparse.Namespace) -> Subject:
     from rl_yardstick.pipeline.settings import check_agent, parse_assignments
 
     module, _, attribute = (args.script or "").rpartition(":")
-    args.gym_packages += [module] if module else []
+    args.gym_packages = [*args.gym_packages, *([module] if module else [])]
     cli.import_typed(args)
     from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject
 

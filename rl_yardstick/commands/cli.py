@@ -278,7 +278,7 @@ def import_typed(args: argparse.Namespace) -> None:
     for key in [key for key in ("algo", "algos") if getattr(args, key, None)]:
         algos = getattr(args, key)
         words = algos if isinstance(algos, list) else [algos]
-        args.gym_packages += [word for word in words if ":" in word]
+        args.gym_packages = [*args.gym_packages, *(word for word in words if ":" in word)]
         names = [*map(agent_name, words)]
         setattr(args, key, names if isinstance(algos, list) else names[0])
     import_modules(args.gym_packages)

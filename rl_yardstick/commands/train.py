@@ -207,7 +207,7 @@ def entry_from_flags(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
     for key in ("n_timesteps", "n_episodes"):
         if (budget := getattr(args, key)) > 0:
             changes[key] = budget
-    trial = trial_from_flags(args)
+    trial = trial_from_flags(args) if "storage" in args else {}  # shaping has no such flag
     try:
         entry = read_entry(args.algo, args.env, args.conf_file, changes.get("env_kwargs"))
     except UserError:

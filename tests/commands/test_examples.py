@@ -17,6 +17,7 @@ LONG = ("compare", "tune", "audit")  # of these only the flags are read
 FIRST = """
 train.py --algo ppo --env Warehouse-v0 -n 64 --seed 0
 train.py --algo sarsa --env Warehouse-v0 -n 64
+train.py --algo ppo --env CartPole-v1 -n 64 -f rl-trained-agents
 train.py --algo dqn --env CartPole-v1 -n 20000 --save-freq 20000 -params learning_starts:20000
 compare.py --algos dqn --env Taxi-v4 -n 20 --seeds 1 --name my_study --no-report
 """
