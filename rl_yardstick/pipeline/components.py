@@ -70,9 +70,7 @@ def import_modules(typed: Iterable[str]) -> None:
         except UserError:
             raise
         except ModuleNotFoundError as error:
-            hint = did_you_mean(name, [f"{path.stem}:{cls}" for path in Path().glob("*.py")])
-            fault = f"no module named {error.name}{f': {hint}' if cls and hint else ''}"
-            raise UserError(f"--gym-packages {name}: {fault}") from error
+            raise UserError(f"--gym-packages {name}: no module named {error.name}") from error
         except (Exception, SystemExit) as error:  # an import may raise anything
             last = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{last.filename}:{last.lineno}"
