@@ -181,6 +181,12 @@ def test_tables_are_judged_as_their_numbers_are(tmp_path, made, words):
     check(judge(path, env="Lake-v7"), words)
 
 
+def test_a_table_of_one_run_has_the_labels_of_its_path(tmp_path):
+    for (agent, seed), rows in curves("return").groupby(["algo", "run"]):
+        rows[["global_step", "return"]].to_csv(tmp_path / f"{agent}_{seed}.csv", index=False)
+    check(judge(tmp_path, env="Lake-v7"), "last return")
+
+
 def test_columns_are_those_that_are_named(tmp_path):
     made = table().rename(columns={"agent": "who", "score": "points"})
     assert "points" in " ".join(judge(made, columns={"agent": "who", "score": "points"}).notes)
