@@ -145,9 +145,9 @@ def _read_file(path: Path, run: Log, columns: Mapping[str, str], notes: list[str
 def _add_settings(log: Log) -> None:
     """Add the environment that this project or rl_zoo3 has recorded."""
     saved: dict[str, Any] = {}
-    for file in ("config.yml", "args.yml"):  # rl_zoo3 uses the latter before the former
-        for path in log.path.glob(f"*/{file}"):
-            saved |= {key: value for key, value in read_saved(path).items() if value}
+    # rl_zoo3 uses the latter before the former.
+    for path in (*log.path.glob("*/config.yml"), *log.path.glob("*/args.yml")):
+        saved |= {key: value for key, value in read_saved(path).items() if value}
     kwargs = saved.get("env_kwargs")
     log.env = str(saved.get("env") or log.env)
     log.env_kwargs = kwargs if isinstance(kwargs, dict) else {}

@@ -22,7 +22,7 @@ from rl_yardstick.experiments.results import (
     HIDDEN_COLUMNS,
     OF_RUN,
     RUN_COLUMNS,
-    RunResults,
+    Curve,
     StudyResults,
     evaluation_curve,
     joined,
@@ -92,11 +92,9 @@ def _labelled(logs: Sequence[Log], notes: list[str], options: Options) -> list[L
         environment = log.labels.get("env") or log.env or options.env
         log.labels = {"agent": log.labels["agent"], "env": environment}
         key = (*log.labels.values(), seed.zfill(20), "" if seed else log.place)
-        if key in runs:
-            one = f"{log.labels['agent']}, {environment}, {seed}"
-            both = f"{runs[key].place} and {log.place}"
-            raise UserError(f"two runs are {one}: {both}; --pattern splits them")
-        runs[key] = log
+        if (other := runs.setdefault(key, log)) is not log:
+            both = f"{', '.join([*log.labels.values(), seed])}: {other.place} and {log.place}"
+            raise UserError(f"two runs are {both}; --pattern splits them")
     for pattern, n in used.items():
         notes.append(f"labels of {n:,} from their paths, by --pattern '{pattern}'")
     return [runs[key] for key in sorted(runs)]
@@ -139,15 +137,13 @@ def results_of(
         figures=options.figures,
         figure=words,
     )
-    planned = [
-        PlannedRun(*of, seed, places[of[1]][0], Path(log.place))
-        for of, seed, log in zip(labels, seeds, logs, strict=True)
-    ]
-    runs = [
-        _read(study, run, log, log.figures[kind], places[run.environment][1])
-        for run, log in zip(planned, logs, strict=True)
-    ]
-    rows, curves = [one.rows[0] for one in runs], [curve for one in runs for curve in one.curves]
+    planned, rows, curves = list[PlannedRun](), list[dict[str, Any]](), list[Curve]()
+    for (agent, env), seed, log in zip(labels, seeds, logs, strict=True):
+        spec, scale = places[env]
+        planned.append(PlannedRun(agent, env, seed, spec, Path(log.place)))
+        row, *of_run = _read(study, planned[-1], log, log.figures[kind], scale)
+        rows.append(row)
+        curves += of_run
     hidden = HIDDEN_COLUMNS if any(row["full_optimum"] is not None for row in rows) else ()
     table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *hidden])
     return StudyResults(study, root, table, joined(curves), tuple(planned))
@@ -176,7 +172,7 @@ def _place(place: str, logs: Sequence[Log], options: Options) -> tuple[TrainSpec
 
 def _read(
     study: StudySpec, run: PlannedRun, log: Log, value: float, scale: Yardstick | None
-) -> RunResults:
+) -> tuple[dict[str, Any], Curve, Curve]:
     """A run's row of the summary and its curves, as those of a run folder."""
     evaluated, episodes = log.evaluations, log.episodes
     figures = {} if scale is None else scale.figures(value)
@@ -188,9 +184,8 @@ def _read(
     }
     curve = evaluation_curve(run, episodes, evaluated.steps, evaluated.returns)
     row = summary_row(study, run, recorded, episodes, curve)
-    labels = {"agent": run.agent, "environment": run.environment, "path": log.place}
-    named = {**row, **labels, "env_id": run.spec.env_id}
-    return RunResults([named], [curve, training_curve(run, episodes)])
+    row |= {"agent": run.agent, "environment": run.environment, "path": log.place}
+    return {**row, "env_id": run.spec.env_id}, curve, training_curve(run, episodes)
 
 
 # --- in Python ------------------------------------------------------------------------------------
