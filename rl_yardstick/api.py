@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import base64
 import html
-import inspect
 import json
 import shlex
 import signal
@@ -23,11 +22,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property, partial
-from hashlib import sha256
 from importlib.util import find_spec
 from io import StringIO
 from itertools import count
@@ -50,8 +48,6 @@ from rl_yardstick.diagnosis.explanation import explanation
 from rl_yardstick.experiments.plan import StudyRecord, specs_of
 from rl_yardstick.experiments.pool import REGISTRATIONS
 from rl_yardstick.experiments.results import read_evaluations
-from rl_yardstick.experiments.study import file_name
-from rl_yardstick.mdp import finite_horizon_optimum
 from rl_yardstick.pipeline import training
 from rl_yardstick.pipeline.environments import check_env_id, with_files_read
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown
@@ -158,8 +154,8 @@ def train(env: Any, algo: str | type = "ppo", **settings: Any) -> Run:
 def compare(envs: Any, algos: Any, seeds: int = 10, **settings: Any) -> Study:
     """Compare agents over seeds, as ``compare.py``; ``envs`` and ``algos`` are one or a list.
 
-    The same call again does the missing runs alone. Other settings, or other code of your classes,
-    make another folder, unless ``name`` is given.
+    The same call again does the missing runs alone; with other settings, or other code of your
+    classes, it needs another ``name``.
     """
     args = _flags(compare_command, envs, algos, {"seeds": seeds, **settings})
     study, text = compare_command.study_spec(args), StringIO()
@@ -216,7 +212,7 @@ def optimum(env: Any, **env_kwargs: Any) -> Told:
 
     Returns by name: undiscounted returns ``optimum`` and ``baseline`` (of the best random or
     constant policy), ``horizon`` (steps), ``values`` (shape (S,)), ``actions`` (those optimal with
-    all steps left, bool (S, A)), ``policy`` (an optimal action at each step, (horizon, S)).
+    all steps left, bool (S, A)).
     """
     env_id, kwargs = _environment(env)
     check_env_id(env_id)
@@ -227,10 +223,7 @@ def optimum(env: Any, **env_kwargs: Any) -> Told:
     scale, (values, actions) = known.yardstick, known.optimum
     figures = {"optimum": scale.optimum, "baseline": scale.baseline, "horizon": known.horizon}
     lines = [f"{key:<14}{value:,.6g}" for key, value in figures.items()]
-    policy = finite_horizon_optimum(known.model, known.horizon).policy
-    return Told(
-        {**figures, "values": values, "actions": actions, "policy": policy}, [env_id, *lines]
-    )
+    return Told({**figures, "values": values, "actions": actions}, [env_id, *lines])
 
 
 def tune(env: Any, algo: str | type, **settings: Any) -> Told:
@@ -254,7 +247,6 @@ def tune(env: Any, algo: str | type, **settings: Any) -> Told:
 # Flags that are no settings in Python; some hyperparameters have their names.
 _NONE = {"help", "list", "resume", "resume_or_start", "env", "algo", "algos", "params", "columns"}
 _NONE |= {"hyperparams", "policy", "logged", "cluster", "until_decided", "max_seeds"}
-_BESIDE = {"folder", "seeds", "first_seed", "jobs", "no_report"}  # these change no run
 _PLAIN: Any = {"force_jupyter": False, "force_terminal": False}
 
 
@@ -284,8 +276,6 @@ def _flags(command: Any, envs: Any, algos: Any, settings: Mapping[str, Any]) -> 
     args.command = shlex.join(["yardstick", command.__name__.rpartition(".")[2], *words])
     if ids:
         import_typed(args)
-    if getattr(args, "name", "") is None:
-        args.name = _name([*ids, *names], [*envs, *algos], settings)
     return args
 
 
@@ -293,19 +283,6 @@ def _assignments(values: Mapping[str, Any]) -> list[str]:
     """``name:literal`` words; classes by their names, such as ``torch.nn.Tanh``."""
     texts = json.dumps(dict(values), default=lambda one: f"{one.__module__}.{one.__qualname__}")
     return [f"{key}:{value!r}" for key, value in json.loads(texts).items()]
-
-
-def _name(names: Sequence[str], made: Sequence[Any], settings: Mapping[str, Any]) -> str | None:
-    """A name of a folder, with a digest of settings and sources; None without any."""
-    deciding = [f"{key}={value}" for key, value in settings.items() if key not in _BESIDE]
-    for one in made:
-        kind = one if isinstance(one, type) or inspect.isfunction(one) else type(one)
-        # Of a class in a notebook, only the sources of its methods are known.
-        for part in () if kind is str else (kind, *vars(kind).values()):
-            with suppress(OSError, TypeError):
-                deciding.append(inspect.getsource(getattr(part, "py_func", part)))
-    digest = sha256("\n".join(sorted(deciding)).encode()).hexdigest()[:8]
-    return file_name(f"{'-'.join(names).replace('/', '-')[:60]}_{digest}") if deciding else None
 
 
 def _environment(given: Any, is_alone: bool = True) -> tuple[str, dict[str, Any]]:

@@ -7,9 +7,8 @@ import hmac
 import inspect
 import pickle
 import random
-from contextlib import suppress
 from copy import deepcopy
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, ClassVar, Self
 
 import cloudpickle
@@ -46,8 +45,8 @@ class PlainAgent(OnlineAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"PlainPolicy": PlainPolicy}
     hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
-    excluded_from_states = ("_judged",)
-    _rebuilt = (*OnlineAlgorithm._rebuilt, "agent", "_action", "_judged")
+    excluded_from_states = ("judged",)
+    _rebuilt = (*OnlineAlgorithm._rebuilt, "agent", "_action", "judged")
     plain: ClassVar[type]
     policy: PlainPolicy
     agent: Any  # of the class `plain`
@@ -56,7 +55,6 @@ class PlainAgent(OnlineAlgorithm):
         own = hyperparameters_of(self.plain)
         self.hyperparams = {name: kw.pop(name) for name in own if name in kw}
         self.state: dict[str, Any] = {}  # of the agent, in a zip
-        self._judged: Any = None  # a copy of the agent, until that learns on
         super().__init__(policy, *a, **kw)
         if kw.get("_init_setup_model", True) and self.n_envs != 1:
             raise ValueError("it learns from one environment at a time: n_envs must be 1")
@@ -69,7 +67,7 @@ class PlainAgent(OnlineAlgorithm):
         self.policy = PlainPolicy(self.observation_space, self.action_space)
         self.policy.owner = self
         self.agent = self._made()
-        self._judged, _ = deepcopy(self.agent), self._state()  # what fails, fails at the start
+        _ = self.judged, self._state()  # what fails, fails at the start
 
     def _made(self) -> Any:
         seen, done, outside = self.observation_space, self.action_space, gym.Env[Any, Any]()
@@ -81,12 +79,10 @@ class PlainAgent(OnlineAlgorithm):
 
     # --- acting and learning ----------------------------------------------------------------------
 
-    @property
+    @cached_property
     def judged(self) -> Any:
-        """A copy of the agent as it is now."""
-        if self._judged is None:
-            self._judged = deepcopy(self.agent)
-        return self._judged
+        """A copy of the agent, until that learns on."""
+        return deepcopy(self.agent)
 
     def greedy_actions(self, rows: list[Any]) -> list[Any] | None:
         """The actions at observations without exploration; None if the class has none."""
@@ -118,12 +114,13 @@ class PlainAgent(OnlineAlgorithm):
         return np.asarray(action, dtype=space.dtype)
 
     def _choose_actions(self) -> NDArray[Any]:
-        self._judged, obs = None, rows_of(self._last_obs)[0]
-        self._action = self.agent.act(obs)
+        vars(self).pop("judged", None)
+        self._action = self.agent.act(rows_of(self._last_obs)[0])
         return self.as_array(self._action)[None]
 
     def _learn_from(self, transitions: Transitions) -> None:
-        self._judged, is_over = None, bool(transitions.dones[0])
+        vars(self).pop("judged", None)
+        is_over = bool(transitions.dones[0])
         terminated, reward = bool(transitions.terminated[0]), float(transitions.rewards[0])
         obs, next_obs = rows_of(transitions.obs)[0], rows_of(transitions.next_obs)[0]
         takes = parameters_of(self.plain, "learn")
@@ -158,7 +155,7 @@ class PlainAgent(OnlineAlgorithm):
             return ""
         return "act draws at random or remembers (see values and explore in docs/own-agent.md)"
 
-    # --- files: the state as data where it can be, else as a pickle with the user's signature -----
+    # --- files: the state as data by `state_dict`, else a pickle with the user's signature --------
 
     def save(self, *a: Any, **kw: Any) -> None:
         """As of every agent."""
@@ -169,11 +166,6 @@ class PlainAgent(OnlineAlgorithm):
     def _state(self) -> dict[str, Any]:
         if hasattr(self.plain, "state_dict") and hasattr(self.plain, "load_state_dict"):
             return {"state_dict": dict(self.agent.state_dict())}
-        found = self.agent.__getstate__() or {}
-        if isinstance(found, dict) and not hasattr(self.plain, "__setstate__"):
-            with suppress(model_files.UnknownTypeError):
-                model_files.encode(found)
-                return {"attributes": found}
         pickled = cloudpickle.dumps(self.agent)
         content = hmac.digest(model_files.key_of_user(), pickled, "sha256") + pickled
         return {"pickle": base64.b64encode(content).decode()}
@@ -183,9 +175,7 @@ class PlainAgent(OnlineAlgorithm):
         """As of every agent."""
         model = super().load(*a, **kw)
         kind, content = model.state.popitem()
-        if kind == "attributes":
-            vars(model.agent).update(content)
-        elif kind == "state_dict":
+        if kind == "state_dict":
             model.agent.load_state_dict(content)
         else:
             given, pickled = (part := base64.b64decode(content))[:32], part[32:]
@@ -193,7 +183,7 @@ class PlainAgent(OnlineAlgorithm):
             if not hmac.compare_digest(given, wanted):
                 raise ValueError("it holds a pickle, not signed with your key, which is not loaded")
             model.agent = pickle.loads(pickled)  # noqa: S301  # signed
-        model._judged = None
+        vars(model).pop("judged", None)
         return model
 
 

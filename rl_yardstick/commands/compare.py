@@ -184,9 +184,9 @@ def judge_logs(args: argparse.Namespace, stop: Stop) -> int:
     if (root / "study.json").exists():
         raise UserError(f"{root} is a study's folder: give another one by --name NAME")
     with console.status("reading the logs"):
-        found = find_logs(paths, columns)
-        results = results_of(found, options, root)
-    for line in (results.study.title, *found.notes):
+        logs, notes = find_logs(paths, columns)
+        results = results_of(logs, notes, options, root)
+    for line in (results.study.title, *notes):
         console.print(line)
     workers = workers_of(args, root, None)
     with held(root), workers:

@@ -9,10 +9,9 @@ import importlib.util
 import io
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +48,9 @@ NAMES = {
 # Columns with an episode of training in each row, and with means over such episodes.
 OF_EPISODES = ("episodic_return", "episode_return", "episode_reward", "episode_rewards", "r")
 OF_MEANS = ("ep_rew_mean", "eprewmean", "episode_reward_mean", "avg_episodic_return")
+# Other files in run folders of this project.
+_NO_LOGS = ("diagnosis.csv", "value_maps.npz", "pulls.npz", "pull_statistics.npz")
 _OF_RUN = re.compile(r"(\d+\.)?monitor\.csv|evaluations\.npz|progress\.csv|run\.json|.*tfevents.*")
-
 
 NOTHING = Episodes(np.empty(0), np.empty(0), np.empty(0))
 
@@ -65,11 +65,9 @@ class Log:
     env: str = ""  #: its environment, where a header or a file of settings tells it
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)  #: the environment's arguments
     figures: dict[str, float] = field(default_factory=dict)  #: final figures by kind
-    recorded: Mapping[str, Any] = field(default_factory=dict)  #: all figures of `FINAL`
     evaluations: Episodes = NOTHING  #: the curve of evaluations, or of a column of a table
     episodes: Episodes = NOTHING  #: those of training
     monitors: list[Floats] = field(default_factory=list)  #: those in each of Monitor's files
-    is_of_events: bool = False  #: of event files alone, as beside another log of the same run
 
     def add(self, name: str, steps: Any, values: Any) -> None:
         """Add the curve in a column, and its final figure, unless there is one of this kind."""
@@ -86,126 +84,94 @@ class Log:
                 self.evaluations = line
 
 
-@dataclass
-class Found:
-    """All logs in what was given, and remarks on them."""
-
-    logs: list[Log] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)  #: why each other file is no log
-
-    @contextmanager
-    def noting(self) -> Iterator[None]:
-        """Note the error of a file that is no log."""
-        try:
-            yield
-        except (UserError, OSError) as error:
-            self.skipped.append(one_line(error))
-
-
-def find_logs(paths: Sequence[Path], columns: Mapping[str, str]) -> Found:
+def find_logs(paths: Sequence[Path], columns: Mapping[str, str]) -> tuple[list[Log], list[str]]:
     """Read all logs in files and folders; ``columns`` has a table's own names by those in `NAMES`.
 
-    Raises:
-        UserError: if a named file is no log, or nothing was found.
+    Returns the logs, and remarks on what was read. Raises UserError if nothing was found.
     """
-    found, typed = Found(), dict[Path, list[str]]()
+    logs, notes, skipped = list[Log](), list[str](), list[str]()
+    files = dict[Path, list[str]]()
     if strange := [name for name in columns if name not in NAMES]:
         raise unknown("--columns: unknown", strange[0], NAMES)
     for path in paths:
         if not path.is_dir():
-            typed.setdefault(path.parent, []).append(path.name)
+            files.setdefault(path.parent, []).append(path.name)
         for folder, below, names in os.walk(path):
             below[:] = sorted(name for name in below if not name.startswith("."))
             if "verdicts.json" not in names:  # else the tables here are this project's
-                _read_folder(Path(folder), names, columns, found)
-    n_skipped = len(found.skipped)
-    for parent, names in typed.items():
-        _read_folder(parent, names, columns, found)
-    if found.skipped[n_skipped:]:
-        raise UserError(found.skipped[n_skipped])
-    if not found.logs:
+                files.setdefault(Path(folder), []).extend(names)
+    for place, names in files.items():
+        run = Log(str(place.resolve()), place)
+        for name in sorted(names):
+            try:
+                logs += _read_file(place / name, run, columns, notes)
+            except (UserError, OSError) as error:
+                skipped.append(one_line(error))
+        if run.figures:
+            logs.append(run)
+            with suppress(UserError, OSError):
+                _add_settings(run)
+    if not logs:
         kinds = "monitor.csv, evaluations.npz, progress.csv, event files or tables as .csv"
-        raise UserError("; ".join([f"no logs in {paths[0]}: give {kinds}", *found.skipped[:1]]))
-    if n := len(found.skipped):
-        found.notes.append(f"skipped {n:,} file{'s' * (n > 1)}: {'; '.join(found.skipped[:3])}")
-    return found
+        raise UserError("; ".join([f"no logs in {paths[0]}: give {kinds}", *skipped[:1]]))
+    if n := len(skipped):
+        notes.append(f"skipped {n:,} file{'s' * (n > 1)}: {'; '.join(skipped[:3])}")
+    return logs, notes
 
 
-def _read_folder(folder: Path, names: list[str], columns: Mapping[str, str], found: Found) -> None:
-    """Read the logs among these files of a folder, each of which may be damaged."""
-    of_run = list(filter(_OF_RUN.fullmatch, names))
-    run = Log(str(folder.resolve()), folder, is_of_events=all("tfevents" in n for n in of_run))
-    logs = [run] if of_run else []
-    with found.noting():
-        _add_settings(run, of_run)
-    for name in sorted(names):
-        path, start = folder / name, re.sub(r"[._-]?(monitor\.csv|npz)$", "", name)
-        log = run if name in of_run else Log(f"{run.place}/{start}", path)
-        logs += [] if name in of_run else [log]
-        with found.noting():
-            if name.endswith("monitor.csv"):
-                _add_monitor(log, path, found.notes)
-            elif path.suffix == ".npz" and name not in _NO_LOGS:
-                log.add(EVALUATION, *read_evaluations(path))
-            elif name == "progress.csv":
-                table = _read_table(path, found.notes)
-                step = _named_columns(table, {}, path).get("step")
-                _add_columns(log, table, step, returns_in(table.columns))
-            elif path.suffix in (".csv", ".tsv") and name not in _NO_LOGS:
-                logs += table_logs(_read_table(path, found.notes), path, columns, found.notes)
-            elif "tfevents" in name:
-                _add_events(log)
-    found.logs += [log for log in logs if log.figures]
+def _read_file(path: Path, run: Log, columns: Mapping[str, str], notes: list[str]) -> list[Log]:
+    """Add what a file tells of its folder's run; return the logs of other runs in it."""
+    name, place = path.name, re.sub(r"[._-]?(monitor\.csv|npz)$", "", path.name)
+    log = run if _OF_RUN.fullmatch(name) else Log(f"{run.place}/{place}", path)
+    if name == RECORD:
+        final = Run(run.path).recorded().get("final")
+        if isinstance(final, dict) and isinstance(final.get("mean_return"), int | float):
+            run.figures[FINAL] = float(final["mean_return"])
+    elif name.endswith("monitor.csv"):
+        _add_monitor(log, path, notes)
+    elif path.suffix == ".npz" and name not in _NO_LOGS:
+        log.add(EVALUATION, *read_evaluations(path))
+    elif name == "progress.csv":
+        table = _read_table(path)
+        step = _named_columns(table, {}, path).get("step")
+        _add_columns(run, table, step, returns_in(table.columns))
+    elif path.suffix in (".csv", ".tsv") and name not in _NO_LOGS:
+        return table_logs(_read_table(path), path, columns, notes)
+    elif "tfevents" in name:
+        _add_events(run)
+    return [log] if log is not run and log.figures else []
 
 
-# --- run folders ----------------------------------------------------------------------------------
-
-_TEXTS = ("acts_by", "measured_by")  # among final figures
-# Other files in run folders of this project.
-_NO_LOGS = ("diagnosis.csv", "value_maps.npz", "pulls.npz", "pull_statistics.npz")
-
-
-def _add_settings(log: Log, names: Sequence[str]) -> None:
-    """Add what a run of this project or of rl_zoo3 has recorded of itself."""
+def _add_settings(log: Log) -> None:
+    """Add the environment that this project or rl_zoo3 has recorded."""
     saved: dict[str, Any] = {}
-    for file in ("config.yml", "args.yml"):  # rl_zoo3 uses the latter before the former
-        for path in log.path.glob(f"*/{file}") if names else ():
-            saved |= {key: value for key, value in read_saved(path).items() if value}
-    env, kwargs = saved.get("env"), saved.get("env_kwargs")
-    log.env, log.env_kwargs = str(env or ""), kwargs if isinstance(kwargs, dict) else {}
-    final = Run(log.path).recorded().get("final") if RECORD in names else None
-    if isinstance(final, dict) and isinstance(final.get("mean_return"), int | float):
-        kinds = {name: str if name in _TEXTS else int | float for name in final}
-        kept = {name: one for name, one in final.items() if isinstance(one, kinds[name])}
-        log.recorded = kept if "baseline" in kept else {}  # else it is on no scale
-        log.figures[FINAL] = float(final["mean_return"])
+    # rl_zoo3 uses the latter before the former.
+    for path in (*log.path.glob("*/config.yml"), *log.path.glob("*/args.yml")):
+        saved |= {key: value for key, value in read_saved(path).items() if value}
+    kwargs = saved.get("env_kwargs")
+    log.env = str(saved.get("env") or log.env)
+    log.env_kwargs = kwargs if isinstance(kwargs, dict) else {}
 
 
 def _add_monitor(log: Log, path: Path, notes: list[str]) -> None:
     """Add the episodes in a file of Monitor; rows that are none are named and skipped."""
-    width, rows, faulty = 0, list[list[float]](), list[str]()
     text = read_bytes(path, MAX_TABLE).decode(errors="replace")
-    for number, line in enumerate(text.splitlines(), start=1):
-        cells = line.split(",")
-        if line.startswith("#"):  # settings as JSON
-            log.env = log.env or "".join(re.findall(r'"env_id": *"([^"]+)"', line)[:1])
-        elif line.startswith("r,l"):
-            width = len(cells)
-        elif line.strip():
-            width = width or len(cells)
-            with suppress(ValueError):
-                r, length, t = map(float, cells[:3])
-                if len(cells) == width and isfinite(r + t) and length >= 1:
-                    rows.append([r, length, t])
-                    continue
-            faulty.append(str(number))
-    if faulty and not rows:
-        raise UserError(f"{path} is no log of episodes: it needs rows of r,l,t")
-    if n := len(faulty):
+    lines = pd.Series(text.splitlines(), dtype=str)
+    is_comment = lines.str.startswith("#")  # settings as JSON
+    ids = re.findall(r'"env_id": *"([^"]+)"', " ".join(lines[is_comment]))
+    log.env = log.env or "".join(ids[:1])
+    lines = lines[~is_comment & (lines.str.strip() != "")]
+    is_whole = lines.str.count(",") == lines.str.count(",")[:1].sum()
+    cells = lines[~lines.str.startswith("r,l")].str.split(",", n=3, expand=True)
+    table = cells.reindex(columns=range(3)).apply(pd.to_numeric, errors="coerce")
+    good = np.isfinite(table).all(axis=1) & (table[1] >= 1) & is_whole[table.index]
+    if n := int((~good).sum()):
+        if n == len(table):
+            raise UserError(f"{path} is no log of episodes: it needs rows of r,l,t")
+        faulty = (table.index[~good] + 1).astype(str)
         which = f"line{'s' * (n > 1)} {', '.join(faulty[:5])}{', ...' * (n > 5)}"
-        notes.append(f"{path}: skipped {n:,} of {n + len(rows):,} rows, no episodes: {which}")
-    log.monitors += [np.array(rows)] if rows else []
+        notes.append(f"{path}: skipped {n:,} of {len(table):,} rows, no episodes: {which}")
+    log.monitors += [table[good].to_numpy(np.float64)] if good.any() else []
     if log.monitors:  # the mean over the environments of the run
         log.figures[TRAINING] = float(np.mean([one[-LAST:, 0].mean() for one in log.monitors]))
         log.episodes = joined_episodes(log.monitors)
@@ -246,17 +212,14 @@ def returns_in(names: Iterable[str]) -> list[str]:
     return list({kind_of(name): name for _, name in sorted(places, reverse=True)}.values())[::-1]
 
 
-def _read_table(path: Path, notes: list[str]) -> pd.DataFrame:
+def _read_table(path: Path) -> pd.DataFrame:
     """A text table with a row of headings; commas, semicolons or tabs separate its cells."""
     content = read_bytes(path, MAX_TABLE).decode(errors="replace")
     separator = max(",;\t", key=content.partition("\n")[0].count)
     try:
-        table = pd.read_csv(io.StringIO(content), sep=separator, on_bad_lines="skip")
+        return pd.read_csv(io.StringIO(content), sep=separator)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is no table: {one_line(error)}") from error
-    if n := sum(map(bool, content.splitlines())) - 1 - len(table):
-        notes.append(f"{path}: skipped {n:,} rows with more cells than headings")
-    return table
 
 
 def table_logs(
@@ -270,25 +233,27 @@ def table_logs(
         table = table.drop(columns=["tag", "value"]).assign(**values)
     if charts := _chart_logs(table, path):
         return charts
-    names, keys = _named_columns(table, columns, path), ("agent", "env", "seed")
+    names = _named_columns(table, columns, path)
     scores = [columns["score"]] if "score" in columns else returns_in(table.columns)
     if not scores:
         held = ", ".join(table.columns[:8])
         raise UserError(f"{path} has no known column of returns ({held}): --columns score=NAME")
     table = table[table[scores].apply(pd.to_numeric, errors="coerce").notna().any(axis=1)]
-    step, given = names.get("step"), [key for key in keys if key in names]
+    step, given = names.get("step"), [key for key in ("agent", "env", "seed") if key in names]
+    by = [table[names[key]] for key in given] or [pd.Series(0, table.index)]
     if "seed" not in names:
-        by = [table[names[key]] for key in given] or [pd.Series(0, table.index)]
-        part = table.groupby(by).cumcount()
-        if step is not None:
-            part = (pd.to_numeric(table[step]).groupby(by).diff() < 0).groupby(by).cumsum() + 0
-        table, names["seed"], given = table.assign(seed=part), "seed", [*given, "seed"]
-        taken = "each row" if step is None else f"each part, to where {step!r} falls,"
-        notes.append(f"{path} has no column of seeds: {taken} counts as a seed")
+        steps = None if step is None else pd.to_numeric(table[step], errors="coerce")
+        begins = pd.Series(True, table.index) if steps is None else steps.groupby(by).diff() < 0
+        seed = begins.groupby(by).cumsum()
+        if seed.nunique() > 1:
+            by, given = [*by, seed], [*given, "seed"]
+            taken = "each row" if step is None else f"each part, to where {step!r} falls,"
+            notes.append(f"{path} has no column of seeds: {taken} counts as a seed")
     logs = []
-    for of, rows in table.groupby([names[key] for key in given], sort=False):
-        texts = [re.sub(r"\.0$", "", str(value)) for value in of]
-        log = Log(", ".join([str(path), *texts]), path, dict(zip(given, texts, strict=True)))
+    for of, rows in table.groupby(by, sort=False):
+        texts = [re.sub(r"\.0$", "", str(value)) for value in of][: len(given)]
+        place = ", ".join([str(path.with_suffix("")), *texts])
+        log = Log(place, path, dict(zip(given, texts, strict=True)))
         _add_columns(log, rows, step, scores)
         logs.append(log)
     return logs
@@ -299,11 +264,11 @@ def _named_columns(table: pd.DataFrame, columns: Mapping[str, str], path: Path) 
     if wrong := [name for name in columns.values() if name not in table.columns]:
         raise unknown(f"{path}: no column", wrong[0], table.columns)
     filled = {_short(name): name for name in table.columns[::-1] if table[name].notna().any()}
-    found = {key: known for key, known in columns.items() if key != "score"}
-    for key in {"agent", "env", "seed", "step"} - found.keys():
-        usual = [filled[name] for name in NAMES[key].split() if name in filled]
-        found |= {key: usual[0]} if usual else {}
-    return found
+    usual = {
+        key: next((filled[name] for name in names.split() if name in filled), None)
+        for key, names in NAMES.items()
+    }
+    return {key: name for key, name in {**usual, **columns}.items() if name is not None}
 
 
 def _add_columns(log: Log, rows: pd.DataFrame, step: str | None, scores: Sequence[str]) -> None:
@@ -326,7 +291,6 @@ def _chart_logs(table: pd.DataFrame, path: Path) -> list[Log]:
     for column in table.columns[1:]:
         name, _, metric = column.rpartition(" - ")
         if name and returns_in([metric]):
-            name = re.sub(r"^[^:/]+: ", "", name)  # of a group
-            log = logs.setdefault(name, Log(name, path))
-            log.add(metric, table.iloc[:, 0], pd.to_numeric(table[column], errors="coerce"))
+            values = pd.to_numeric(table[column], errors="coerce")
+            logs.setdefault(name, Log(name, path)).add(metric, table.iloc[:, 0], values)
     return list(logs.values())

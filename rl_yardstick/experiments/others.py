@@ -16,13 +16,13 @@ import gymnasium as gym
 import pandas as pd
 
 from rl_yardstick.experiments.analysis import StudyAnalysis, analyse
-from rl_yardstick.experiments.logs import FINAL, WORDS, Found, Log, find_logs, table_logs
+from rl_yardstick.experiments.logs import WORDS, Log, find_logs, table_logs
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.results import (
     HIDDEN_COLUMNS,
     OF_RUN,
     RUN_COLUMNS,
-    RunResults,
+    Curve,
     StudyResults,
     evaluation_curve,
     joined,
@@ -74,12 +74,12 @@ def labels_in(place: str, pattern: str, forms: Mapping[str, str] = FORMS) -> dic
     return {} if found is None else found.groupdict()
 
 
-def _labelled(found: Found, options: Options) -> list[Log]:
+def _labelled(logs: Sequence[Log], notes: list[str], options: Options) -> list[Log]:
     """The logs with all labels, in order, one for each agent, environment and seed."""
     patterns = [options.pattern] if options.pattern else [*PATTERNS]
     forms = {**FORMS, "env": "[^/]+?"} if options.pattern else FORMS
     used, runs = Counter[str](), dict[tuple[str, ...], Log]()
-    for log in sorted(found.logs, key=lambda log: log.is_of_events):
+    for log in logs:
         if "agent" not in log.labels:
             place = str(log.path.with_suffix("")) if log.labels else log.place
             read = ((one, labels_in(place, one, forms)) for one in patterns)
@@ -90,29 +90,28 @@ def _labelled(found: Found, options: Options) -> list[Log]:
             used[pattern] += 1
         seed = re.sub(r"^\D+(?=\d+$)", "", log.labels.get("seed", ""))
         environment = log.labels.get("env") or log.env or options.env
-        log.labels = {"agent": log.labels["agent"], "env": environment, "seed": seed}
-        key = (*log.labels.values(), "" if seed else log.place)
-        if key in runs and not log.is_of_events:
-            both = f"{runs[key].place} and {log.place}"
-            raise UserError(f"two runs are {', '.join(key[:3])}: {both}; --pattern splits them")
-        runs.setdefault(key, log)
+        log.labels = {"agent": log.labels["agent"], "env": environment}
+        key = (*log.labels.values(), seed.zfill(20), "" if seed else log.place)
+        if (other := runs.setdefault(key, log)) is not log:
+            both = f"{', '.join([*log.labels.values(), seed])}: {other.place} and {log.place}"
+            raise UserError(f"two runs are {both}; --pattern splits them")
     for pattern, n in used.items():
-        found.notes.append(f"labels of {n:,} from their paths, by --pattern '{pattern}'")
-    if n := sum(not log.labels["seed"] for log in runs.values()):
-        found.notes.append(f"{n:,} runs without a seed are numbered in their order")
-    return [runs[key] for key in sorted(runs, key=lambda key: (*key[:2], key[2].zfill(20)))]
+        notes.append(f"labels of {n:,} from their paths, by --pattern '{pattern}'")
+    return [runs[key] for key in sorted(runs)]
 
 
 # --- from logs to a study -------------------------------------------------------------------------
 
 
-def results_of(found: Found, options: Options, root: Path) -> StudyResults:
-    """The logs as the results of a study in the folder ``root``; adds notes to ``found``.
+def results_of(
+    every: Sequence[Log], notes: list[str], options: Options, root: Path
+) -> StudyResults:
+    """The logs as the results of a study in the folder ``root``; adds to the notes.
 
     Raises:
         UserError: if labels are missing, or are those of two runs.
     """
-    every, notes = _labelled(found, options), found.notes
+    every = _labelled(every, notes, options)
     counts = Counter(kind for log in every for kind in log.figures)
     kind = max([*WORDS, *counts], key=lambda kind: counts[kind])  # the first that most runs have
     logs = [log for log in every if kind in log.figures]
@@ -126,35 +125,25 @@ def results_of(found: Found, options: Options, root: Path) -> StudyResults:
     if len(agents) == 1:
         notes.append(f"one agent only, {agents[0]}: a comparison needs two")
     places = {env: _place(env, logs, options) for env in dict.fromkeys(env for _, env in labels)}
-    ranks = [labels[:k].count(one) for k, one in enumerate(labels)]
-    seeds = [log.labels["seed"] for log in logs]
-    first = int(seeds[0]) if seeds[0].isdigit() else 0
-    if seeds != [str(first + rank) for rank in ranks]:
-        first = 0
-        notes.append("seeds are numbered from 0 for each agent")
+    seeds = [labels[:k].count(one) for k, one in enumerate(labels)]
     study = StudySpec(
         name=root.name,
         title=f"{', '.join(agents)} on {', '.join(places)}",
         agents=tuple(AgentSpec(agent, "") for agent in agents),
         environments=tuple(EnvironmentSpec(one, spec.env_id) for one, (spec, _) in places.items()),
-        n_seeds=max(ranks) + 1,
-        first_seed=first,
+        n_seeds=max(seeds) + 1,
         metric=options.metric,
         margin=options.margin,
         figures=options.figures,
         figure=words,
     )
-    planned = [
-        PlannedRun(*of, first + rank, places[of[1]][0], Path(log.place))
-        for of, rank, log in zip(labels, ranks, logs, strict=True)
-    ]
-    scales = [places[run.environment][1] for run in planned]
-    runs = [
-        _read(study, run, log, kind, scale)
-        for run, log, scale in zip(planned, logs, scales, strict=True)
-    ]
-    rows, curves = [one.rows[0] for one in runs], [curve for one in runs for curve in one.curves]
-    _note_budgets(rows, notes)
+    planned, rows, curves = list[PlannedRun](), list[dict[str, Any]](), list[Curve]()
+    for (agent, env), seed, log in zip(labels, seeds, logs, strict=True):
+        spec, scale = places[env]
+        planned.append(PlannedRun(agent, env, seed, spec, Path(log.place)))
+        row, *of_run = _read(study, planned[-1], log, log.figures[kind], scale)
+        rows.append(row)
+        curves += of_run
     hidden = HIDDEN_COLUMNS if any(row["full_optimum"] is not None for row in rows) else ()
     table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *hidden])
     return StudyResults(study, root, table, joined(curves), tuple(planned))
@@ -170,46 +159,33 @@ def _place(place: str, logs: Sequence[Log], options: Options) -> tuple[TrainSpec
 
     given, unknown = options.env_kwargs, validated({"algo": "", "env_id": "", "n_timesteps": 1})
     kwargs = [dict(given or log.env_kwargs) for log in logs if log.labels["env"] == place]
-    for env_id in (place, place.replace("-", "/", 1)):
-        entry = gym.registry[env_id].entry_point if env_id in gym.registry else None
-        module = entry.partition(":")[0] if isinstance(entry, str) else "rl_yardstick."
-        is_trusted = module.startswith(("gymnasium.", "rl_yardstick.")) or module in sys.modules
-        if entry is not None and is_trusted and kwargs == kwargs[:1] * len(kwargs):
-            spec = unknown.changed(env_id=env_id, env_kwargs=kwargs[0])
-            with suppress(UserError, *MISTAKES):
-                exact = evaluator_of_single(spec)
-                return spec, bracketed_yardstick(spec) if exact is None else exact.yardstick
+    entry = gym.registry[place].entry_point if place in gym.registry else None
+    module = entry.partition(":")[0] if isinstance(entry, str) else "rl_yardstick."
+    is_trusted = module.startswith(("gymnasium.", "rl_yardstick.")) or module in sys.modules
+    if entry is not None and is_trusted and kwargs == kwargs[:1] * len(kwargs):
+        spec = unknown.changed(env_id=place, env_kwargs=kwargs[0])
+        with suppress(UserError, *MISTAKES):
+            exact = evaluator_of_single(spec)
+            return spec, bracketed_yardstick(spec) if exact is None else exact.yardstick
     return unknown, None
 
 
 def _read(
-    study: StudySpec, run: PlannedRun, log: Log, kind: str, scale: Yardstick | None
-) -> RunResults:
+    study: StudySpec, run: PlannedRun, log: Log, value: float, scale: Yardstick | None
+) -> tuple[dict[str, Any], Curve, Curve]:
     """A run's row of the summary and its curves, as those of a run folder."""
-    evaluated, episodes, value = log.evaluations, log.episodes, log.figures[kind]
+    evaluated, episodes = log.evaluations, log.episodes
     figures = {} if scale is None else scale.figures(value)
-    own = log.recorded if kind == FINAL else {}
     recorded = {
         **dict.fromkeys(OF_RUN),
-        "final": {"mean_return": value, "exact": False, **figures, **own},
+        "final": {"mean_return": value, "exact": False, **figures},
         "best_mean_return": max(evaluated.returns, default=None),
         "n_timesteps": max([*evaluated.steps[-1:], *episodes.steps[-1:]], default=None),
     }
     curve = evaluation_curve(run, episodes, evaluated.steps, evaluated.returns)
     row = summary_row(study, run, recorded, episodes, curve)
-    labels = {"agent": run.agent, "environment": run.environment, "path": log.place}
-    named = {**row, **labels, "env_id": run.spec.env_id}
-    return RunResults([named], [curve, training_curve(run, episodes)])
-
-
-def _note_budgets(rows: Sequence[Mapping[str, Any]], notes: list[str]) -> None:
-    """Note where the runs of some agents are longer than those of others."""
-    table = pd.DataFrame(rows).astype({"n_timesteps": float})
-    for place, here in table.groupby("environment", sort=False):
-        steps = here.groupby("agent")["n_timesteps"].median().dropna().sort_values()
-        if len(steps) > 1 and steps.iloc[-1] > 1.1 * steps.iloc[0]:
-            low, *_, high = (f"{n:,.0f} ({agent})" for agent, n in steps.items())
-            notes.append(f"{place}: budgets differ, from {low} to {high} steps")
+    row |= {"agent": run.agent, "environment": run.environment, "path": log.place}
+    return {**row, "env_id": run.spec.env_id}, curve, training_curve(run, episodes)
 
 
 # --- in Python ------------------------------------------------------------------------------------
@@ -254,10 +230,10 @@ def judge(what: pd.DataFrame | str | Path | Sequence[str | Path], **options: Any
     Raises:
         UserError: if nothing was found, or labels are missing or not unique.
     """
-    chosen, found = Options(**options), Found()
+    chosen, notes = Options(**options), list[str]()
     if isinstance(what, pd.DataFrame):
-        found.logs += table_logs(what, Path("table"), chosen.columns, found.notes)
+        logs = table_logs(what, Path("table"), chosen.columns, notes)
     else:
         paths = [what] if isinstance(what, str | Path) else what
-        found = find_logs([Path(path) for path in paths], chosen.columns)
-    return Judgement(analyse(results_of(found, chosen, Path("runs"))), found.notes)
+        logs, notes = find_logs([Path(path) for path in paths], chosen.columns)
+    return Judgement(analyse(results_of(logs, notes, chosen, Path("runs"))), notes)

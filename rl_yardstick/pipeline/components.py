@@ -25,6 +25,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import gymnasium as gym
 from pydantic import Field, TypeAdapter, ValidationError
 
 from rl_yardstick.agents.own_classes import SMALLEST
@@ -70,9 +71,7 @@ def import_modules(typed: Iterable[str]) -> None:
         except UserError:
             raise
         except ModuleNotFoundError as error:
-            hint = did_you_mean(name, [f"{path.stem}:{cls}" for path in Path().glob("*.py")])
-            fault = f"no module named {error.name}{f': {hint}' if cls and hint else ''}"
-            raise UserError(f"--gym-packages {name}: {fault}") from error
+            raise UserError(f"--gym-packages {name}: no module named {error.name}") from error
         except (Exception, SystemExit) as error:  # an import may raise anything
             last = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{last.filename}:{last.lineno}"
@@ -121,13 +120,20 @@ def module_name(typed: str) -> str:
     return Path(module).stem if module.endswith(".py") or "/" in module else module
 
 
-def digests_of(typed: Iterable[str], algo: str = "") -> dict[str, str]:
-    """A digest of the sources of each imported module of the user, or of a given class, by name."""
+def digests_of(typed: Iterable[str], *names: str) -> dict[str, str]:
+    """A digest of the sources of each imported module of the user, and of given classes, by name.
+
+    ``names`` are of agents and environments, whose classes may stand in no module.
+    """
     found = {}
-    with suppress(OSError):  # of a class that was typed into a console
-        methods = filter(inspect.isfunction, vars(BY_VALUE.get(algo, int)).values())
-        if source := "".join(map(inspect.getsource, methods)):
-            found[algo] = hashlib.sha256(source.encode()).hexdigest()[:12]
+    for name in names:
+        one = BY_VALUE.get(name) or getattr(gym.registry.get(name), "entry_point", None)
+        made = getattr(one, "args", (one,))[0]  # of an object, which is copied
+        cls = made if isinstance(made, type) else type(made)
+        with suppress(OSError):  # of a class that was typed into a console
+            methods = filter(inspect.isfunction, vars(cls).values())
+            if source := "".join(map(inspect.getsource, methods)):
+                found[name] = hashlib.sha256(source.encode()).hexdigest()[:12]
     for name in map(module_name, typed):
         file = Path(getattr(sys.modules.get(name), "__file__", None) or "")
         files = sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]

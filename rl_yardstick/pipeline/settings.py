@@ -385,7 +385,7 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
     plain = {key: value for key, value in algorithm.items() if key not in asked}
     if str(special.get("n_timesteps")).startswith("auto"):
         asked.insert(0, str(special.pop("n_timesteps")))
-    code = digests_of(fields.get("gym_packages", ()), algo)
+    code = digests_of(fields.get("gym_packages", ()), algo, env_id)
     found = {"algo": algo, "env_id": env_id, "algorithm": plain, "code": code}
     found |= {**special, **fields}
     spec = validated(found)

