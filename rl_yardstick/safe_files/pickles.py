@@ -30,7 +30,7 @@ INSTRUCTIONS = frozenset(_NAMES.split())
 # of a sign, since one can make all others of a text four bytes wide.
 _PRICE, _BYTES_PER_SIGN = 160, 4
 MAX_DEPTH, MAX_INTEGER_BITS = 40, 128
-_END_OF_KEYS = (1 << 61) - 1  # larger integers are not their own hash: any number can share one
+END_OF_KEYS = (1 << 61) - 1  # larger integers are not their own hash: any number can share one
 # Packages that were renamed: NumPy's inner one, and Gym, whose spaces Gymnasium took over.
 _RENAMED = {"numpy.core.": "numpy._core.", "gym.spaces.": "gymnasium.spaces."}
 _RENAMED |= {"copy_reg.": "copyreg.", "__builtin__.": "builtins."}  # in protocols 0 to 2
@@ -199,7 +199,7 @@ class Build:
 def pairs(made: Made) -> Iterator[tuple[Any, Any]]:
     """The keys of a dictionary, which are texts and small numbers, and its recorded values."""
     for key, value in zip(made.items[::2], made.items[1::2], strict=True):
-        if not isinstance(key, str | int) or (isinstance(key, int) and abs(key) >= _END_OF_KEYS):
+        if not isinstance(key, str | int) or (isinstance(key, int) and abs(key) >= END_OF_KEYS):
             raise UnsafeFileError("uses something other than texts and numbers as keys")
         yield key, value
 
