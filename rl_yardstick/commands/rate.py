@@ -36,13 +36,12 @@ def build_parser() -> OneLineParser:
     """The flags."""
     words = "Rate Q-tables, models and policies against the exact optimum."
     told = "table, model zip or run folder; a folder of those; or script.py:policy"
-    bins = "of observations, as in bins:10 low:[-2,-3] high:[2,3]"
     flags = (
         flag("files", told, nargs="+", metavar="FILE"),
         flag("--env", "environment id (default: as in the file or run folder)"),
         flag("--algo", "agent in a zip that lies in no run folder"),
         *shared("--env-kwargs", "--gym-packages"),
-        several("--bins", bins),
+        several("--bins", "of observations, as in bins:10 low:[-2,-3] high:[2,3]"),
         flag("--table --csv", "also write the table to this file", Path, metavar="FILE"),
         *shared("--json"),
     )
@@ -73,8 +72,7 @@ def main() -> int:
         frame = pd.DataFrame(rows, columns=COLUMNS)
         write_text(args.table, frame.to_csv(index=False, lineterminator="\n"))
     if args.json is not None:
-        pairs = rated.items()
-        told = {name: one if isinstance(one, str) else one.as_data() for name, one in pairs}
+        told = {k: one if isinstance(one, str) else one.as_data() for k, one in rated.items()}
         write_json(args.json, told)
     return 0
 
@@ -94,8 +92,7 @@ def _ratings(args: Any) -> dict[str, Rating | str]:
     found: dict[str, Rating | str] = {}
     paths = [path for typed in args.files for path in _below(Path(typed))]
     if not paths:
-        suffixes = ", ".join(SUFFIXES)
-        raise UserError(f"{args.files[0]} holds no file to rate: none ends in {suffixes}")
+        raise UserError(f"{args.files[0]} holds no file that ends in {', '.join(SUFFIXES)}")
     for path in paths:
         try:
             if split_class(str(path))[1] and not path.exists():
@@ -119,26 +116,22 @@ def _below(path: Path) -> Iterator[Path]:
     if not path.is_dir() or is_model(path):
         yield path
         return
-    for member in sorted(path.iterdir()):
-        if member.name.startswith((".", "__")) or (member.is_dir() and member.is_symlink()):
-            continue
-        if member.is_dir() or member.suffix.lower() in SUFFIXES:
-            yield from _below(member)
+    for one in sorted(path.iterdir()):
+        is_wanted = not one.is_symlink() if one.is_dir() else one.suffix.lower() in SUFFIXES
+        if is_wanted and not one.name.startswith((".", "__")):
+            yield from _below(one)
 
 
 def _rated_script(typed: str, env_id: str | None, **kwargs: Any) -> Rating:
     """The rating of something in a module of the user, which is imported."""
     from rl_yardstick.pipeline.components import import_modules, module_name, split_class
-    from rl_yardstick.rating import rate
+    from rl_yardstick.rating.ratings import rate
 
     module, name = split_class(typed)
     import_modules([module])
     found = getattr(sys.modules[module_name(module)], name, None)
     rated = rate(found() if isinstance(found, type) else found, env_id, **kwargs)
     return replace(rated, name=typed, notes=(*rated.notes, "its own code ran"))
-
-
-# --- what is shown --------------------------------------------------------------------------------
 
 
 def _row(name: str, rated: Rating | str) -> dict[str, Any]:

@@ -1,7 +1,4 @@
-"""Ratings: exact returns, on the scale from the baseline to the optimum, with what explains them.
-
-`rate` is for Python; `rated_tables` is what the command does with each file.
-"""
+"""Ratings: exact returns on the scale from baseline to optimum, with what explains them."""
 
 from __future__ import annotations
 
@@ -88,13 +85,13 @@ def rated_table(table: Table, world: World, name: str) -> Rating:
     is_blank = not table.is_policy and bool((table.values == first).all())
     if is_blank:
         notes.insert(0, f"never trained: every value is {first:g}")
-    if exact is None:
-        best = np.eye(world.shape[1])[table.values.argmax(axis=1)]
-        chances = table.values if table.is_policy else best
-        return _sampled(world, lambda obs: chances[world.row_of(obs)], name, notes)
-    values, model = table.values[world.rows_of_states()], exact.model
-    if table.is_policy:
-        return _exact(world, values, name, notes)
+    if exact is None or table.is_policy:
+        best = table.values.argmax(axis=1)
+        chances = table.values if table.is_policy else np.eye(world.shape[1])[best]
+        return rated_function(lambda obs: chances[world.row_of(obs)], world, name, notes)
+    seen, model = world.observed(), exact.model
+    values = np.zeros((model.n_states, model.n_actions))
+    values[[*seen]] = table.values[[world.row_of(obs) for obs in seen.values()]]
     policy = values.argmax(axis=1)
     met = mdp.state_visitation(model, policy, exact.horizon) > 0
     lowest = np.where(np.isfinite(values), values, np.inf).min(axis=1)
@@ -102,7 +99,7 @@ def rated_table(table: Table, world: World, name: str) -> Rating:
     facts = _ties(values, met, exact)
     facts |= {"equal_met": int((equal & met).sum()), "equal_elsewhere": int((equal & ~met).sum())}
     if not is_blank:
-        notes = [*_better_order(world, policy), *_on_values(facts), *notes]
+        notes = [*_better_order(world, exact, policy), *_on_values(facts), *notes]
     return replace(_exact(world, policy, name, notes, equal), facts=facts)
 
 
@@ -115,17 +112,7 @@ def _exact(
     with suppress(UserError):  # horizon times states are too many
         explained = explanation_of_policy(world.env, world.exact, policy)
     drawn = world.map_of(actions, np.zeros(len(policy), np.bool_) if equal is None else equal)
-    found = world.exact.worth(policy)
-    return Rating(name, world.name, found, tuple(notes), explanation=explained, map=drawn)
-
-
-def _sampled(
-    world: World, chances: Callable[[Any], Any], name: str, notes: Sequence[str] = ()
-) -> Rating:
-    """The rating by episodes, from the probabilities of actions at an observation."""
-    start, rng = int(getattr(world.env.action_space, "start", 0)), np.random.default_rng(SEED)
-    found = world.played(lambda obs: start + int(rng.choice(len(p := chances(obs)), p=p)))
-    return Rating(name, world.name, found, (*notes, f"sampled, {N_EPISODES} episodes"))
+    return Rating(name, world.name, world.exact.worth(policy), (*notes,), {}, explained, drawn)
 
 
 def _ties(values: Floats, met: Bools, exact: ExactEvaluator) -> dict[str, Any]:
@@ -135,9 +122,9 @@ def _ties(values: Floats, met: Bools, exact: ExactEvaluator) -> dict[str, Any]:
     found: dict[str, Any] = {"ties": int(tied.sum()), "ties_met": int((tied & met).sum())}
     # Where observations hide the state, planning would break ties of one observation in many ways.
     if exact.scale is None and model.prob.size * exact.horizon <= MOST_OUTCOMES:
-        turned = replace(model, reward=-model.reward, reward_variance=None)
-        for name, one, sign in (("ties_least", turned, -1), ("ties_most", model, 1)):
-            plan = mdp.finite_horizon_optimum(one, exact.horizon, mask=best)
+        for name, sign in (("ties_least", -1), ("ties_most", 1)):
+            turned = replace(model, reward=sign * model.reward, reward_variance=None)
+            plan = mdp.finite_horizon_optimum(turned, exact.horizon, mask=best)
             found[name] = 0.0 + sign * plan.start_value
     return found
 
@@ -156,10 +143,8 @@ def _on_values(facts: Mapping[str, Any]) -> Iterator[str]:
         yield f"never updated (all values equal): {told}"
 
 
-def _better_order(world: World, policy: Ints) -> Iterator[str]:
+def _better_order(world: World, exact: ExactEvaluator, policy: Ints) -> Iterator[str]:
     """Another order of the actions, if a table scores much better with it."""
-    exact = world.exact
-    assert exact is not None
     n, n_outcomes = exact.model.n_actions, exact.model.prob.size * exact.horizon
     is_quick = n <= MOST_ACTIONS and math.factorial(n) * n_outcomes <= MOST_OUTCOMES
     score = exact.yardstick.score(exact.worth(policy).mean_return)
@@ -178,12 +163,14 @@ def _better_order(world: World, policy: Ints) -> Iterator[str]:
 # --- functions, objects and models ----------------------------------------------------------------
 
 
-def rated_function(act: Callable[[Any], Any], world: World, name: str) -> Rating:
+def rated_function(
+    act: Callable[[Any], Any], world: World, name: str, notes: Sequence[str] = ()
+) -> Rating:
     """The rating of a function from an observation to an action or to probabilities of actions."""
     actions: Any = world.env.action_space
+    sampled = f"sampled, {N_EPISODES} episodes"
     if not isinstance(actions, gym.spaces.Discrete):
-        told = (f"sampled, {N_EPISODES} episodes",)
-        return Rating(name, world.name, world.played(act), told)
+        return Rating(name, world.name, world.played(act), (sampled,))
     start, n = int(actions.start), int(actions.n)
 
     def chances(observation: Any) -> Any:
@@ -198,25 +185,25 @@ def rated_function(act: Callable[[Any], Any], world: World, name: str) -> Rating
         needed = f"it must return an action or {n} probabilities"
         raise UserError(f"{name} returns {shown(answer)} at {shown(observation)}: {needed}")
 
-    if world.exact is None:
-        return _sampled(world, chances, name)
-    observed = world.observed()
-    first, second = ([chances(obs) for obs in observed.values()] for _ in range(2))
-    if not np.array_equal(first, second):
-        return _sampled(world, chances, name, ["it draws its actions, or remembers"])
-    policy = np.full((world.exact.model.n_states, n), 1 / n)
-    policy[list(observed)] = first
-    return _exact(world, policy, name)
+    if world.exact is not None:
+        observed = world.observed()
+        first, second = ([chances(obs) for obs in observed.values()] for _ in range(2))
+        if np.array_equal(first, second):
+            policy = np.full((world.exact.model.n_states, n), 1 / n)
+            policy[[*observed]] = first
+            return _exact(world, policy, name, notes)
+        notes = [*notes, "it draws its actions, or remembers"]
+    rng = np.random.default_rng(SEED)
+    found = world.played(lambda obs: start + int(rng.choice(n, p=chances(obs))))
+    return Rating(name, world.name, found, (*notes, sampled))
 
 
 def acting(what: Any) -> Callable[[Any], Any] | None:
     """The function of anything that acts: an object with a method for it, or a function."""
-    for method in ("predict", "act", "get_action"):
-        found: Any = getattr(what, method, None)
-        if callable(found):
-            is_library = method == "predict" and hasattr(what, "observation_space")
-            return partial(found, deterministic=True) if is_library else found
-    return what if callable(what) else None
+    if hasattr(what, "predict") and hasattr(what, "observation_space"):  # of the library
+        return partial(what.predict, deterministic=True)
+    methods = (getattr(what, name, None) for name in ("predict", "act", "get_action"))
+    return next(filter(callable, (*methods, what)), None)
 
 
 def is_model(path: Path) -> bool:
@@ -241,14 +228,12 @@ def rated_model(path: Path, wanted: Mapping[str, Any]) -> Rating:
     found = find_model(Wanted(path=path, **wanted))
     with closing(playing_env(found, None)) as env:
         agent = load_agent(found, env)
-    judge, explained = Judge(found.spec, agent, Console(quiet=True)), None
+    judge = Judge(found.spec, agent, Console(quiet=True))
     with closing(judge.env):
         evaluation = judge.evaluator.at_the_end(agent)
-    if judge.exact is not None:
-        explained = explanation(found.spec, agent, judge.exact)
+    why = None if judge.exact is None else explanation(found.spec, agent, judge.exact)
     told = () if evaluation.is_exact else (f"sampled, {len(evaluation.returns)} episodes",)
-    notes = (found.spec.algo, *told)
-    return Rating(str(path), found.spec.env_id, evaluation, notes, explanation=explained)
+    return Rating(str(path), found.spec.env_id, evaluation, (found.spec.algo, *told), {}, why)
 
 
 # --- files ----------------------------------------------------------------------------------------
@@ -282,10 +267,9 @@ def rated_tables(
         full = f"{name}[{entry}]" if entry else name
         try:
             found = rated_table(as_table(one, world), world, full)
+            rated[full] = replace(found, notes=(*notes, *found.notes))
         except UserError as error:  # another entry may be the table
             misfit = UserError(f"{full} {error}")
-        else:
-            rated[full] = replace(found, notes=(*notes, *found.notes))
     if not rated:
         raise misfit
     return rated
@@ -311,12 +295,10 @@ def rate(
     """
     if isinstance(what, str | Path) and is_model(Path(what)) and not isinstance(env, gym.Env):
         return rated_model(Path(what), {"env_id": env, "env_kwargs": kwargs})
-
     name = str(what) if isinstance(what, str | Path) else type(what).__name__
     what = content_of(Path(what)) if isinstance(what, str | Path) else what
     if (act := acting(what)) is not None:
-        name = getattr(what, "__name__", name)
-        return rated_function(act, world_of(env, kwargs, bins), name)
+        return rated_function(act, world_of(env, kwargs, bins), getattr(what, "__name__", name))
     found = rated_tables(what, lambda named: world_of(env or named, kwargs, bins), name)
     if len(found) > 1:
         raise UserError(f"holds several tables, {', '.join(found)}: rate one of them")

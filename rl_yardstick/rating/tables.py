@@ -13,14 +13,6 @@ from rl_yardstick.pipeline.errors import UserError, one_line, shown
 from rl_yardstick.rating.worlds import World, by, key_of
 
 SUMS_TO_ONE = 1e-6
-# Where a table of another shape may come from.
-USUAL_SHAPES: Mapping[tuple[int, ...], str] = {
-    (16, 4): "FrozenLake-v1",
-    (64, 4): "FrozenLake-v1 with --env-kwargs map_name:8x8",
-    (48, 4): "CliffWalking-v1",
-    (500, 6): "Taxi-v4",
-    (704, 2): "Blackjack-v1",
-}
 # Names of the table among the contents of a file, the likeliest first.
 USUAL_NAMES = ("qtable", "q_table", "q", "q_values", "qvalues", "table", "policy")
 
@@ -33,9 +25,6 @@ class Table(NamedTuple):
     note: str = ""  #: how the source was read, where that is not obvious
 
 
-# --- the tables in a file -------------------------------------------------------------------------
-
-
 def tables_in(content: Any) -> dict[str, Any]:
     """What may be a table in the content of a file, by name; by an empty name if it stands alone.
 
@@ -44,9 +33,8 @@ def tables_in(content: Any) -> dict[str, Any]:
     if isinstance(content, np.ndarray) and content.dtype == object:
         content = content.item() if content.ndim == 0 else content.tolist()
     found = {"": content}
-    if isinstance(content, Mapping):
-        if any(isinstance(key, str) and not key_of(key) for key in content):
-            found = {str(key).lower(): value for key, value in content.items()}
+    if isinstance(content, Mapping) and any(isinstance(k, str) and not key_of(k) for k in content):
+        found = {str(key).lower(): value for key, value in content.items()}
     elif isinstance(content, list | tuple) and all(
         isinstance(one, Mapping) or getattr(one, "ndim", 0) > 1 for one in content
     ):
@@ -80,8 +68,7 @@ def _of_array(array: NDArray[Any], world: World) -> Table:
     if shape == (n_actions, n):
         note = f"read transposed: it is {by(shape)}, actions x states"
         return _of_values(array.T, np.arange(n), world, note)
-    known = f"; {by(shape)} is the shape of {USUAL_SHAPES[shape]}" if shape in USUAL_SHAPES else ""
-    raise UserError(f"holds a table of shape {by(shape)}: {world.needs()}{known}")
+    raise UserError(f"holds a table of shape {by(shape)}: {world.needs()}")
 
 
 def _of_actions(actions: NDArray[Any], rows: Ints, world: World) -> Table:
@@ -111,22 +98,21 @@ def _of_mapping(content: Mapping[Any, Any], world: World) -> Table:
         states = content.items()
         content = {(state, action): row[action] for state, row in states for action in row}
     keys = {key: key_of(key) for key in content}
-    width, widths = len(next(iter(keys.values()), ())), (1, len(world.sizes))
+    width = len(next(iter(keys.values())))
     wrong = [key for key, parts in keys.items() if len(parts) != width or not parts]
     if wrong:
         raise UserError(f"has the key {shown(wrong[0])}, which is no state of {world.name}")
     parts, values = np.array([*keys.values()]), np.array([*content.values()], np.float64)
-    if values.ndim == 1 and width - 1 in widths:
+    if values.ndim == 1 and width - 1 in (1, len(world.sizes)):
         rows, actions = world.rows(parts[:, :-1]), parts[:, -1]
         if beyond := [action for action in actions.tolist() if not 0 <= action < n_actions]:
             raise UserError(f"has an action {beyond[0]}: {world.name} has 0 to {n_actions - 1}")
         table, known = np.full(world.shape, missing), np.unique(rows)
         table[rows, actions] = values
         return _of_values(table[known], known, world)
-    if width not in widths:
-        raise UserError(f"has keys such as {shown(next(iter(keys)))}: {world.needs()}")
+    rows = world.rows(parts)
     if values.ndim == 1:
-        return _of_actions(values, world.rows(parts), world)
+        return _of_actions(values, rows, world)
     if values.shape[1:] != (n_actions,):
         raise UserError(f"has {values[0].size} values of a state: {world.needs()}")
-    return _of_values(values, world.rows(parts), world)
+    return _of_values(values, rows, world)

@@ -24,13 +24,11 @@ from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator, evaluator_in
 from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, bracket_of
 
 N_EPISODES, SEED = 100, 0  # of a sampled rating
+# Numbers in a text, but not the digits of a name such as int64.
+_NUMBERS = re.compile(r"(?<![\w.])-?\d+(?:\.\d*)?(?:e[-+]\d+)?(?![\w.])|True|False")
 _ARROWS = {(-1, 0): "^", (1, 0): "v", (0, -1): "<", (0, 1): ">"}
 
 Env = gym.Env[Any, Any]
-
-
-# Numbers in a text, but not the digits of a name such as int64.
-_NUMBERS = re.compile(r"(?<![\w.])-?\d+(?:\.\d*)?(?:e[-+]\d+)?(?![\w.])|True|False")
 
 
 def key_of(key: Any) -> tuple[int, ...]:
@@ -100,15 +98,8 @@ class World:
 
     def row_of(self, observation: Any) -> int:
         """The row of one observation."""
-        return int(self.rows(np.array([key_of(observation)]))[0])
-
-    def rows_of_states(self) -> Ints:
-        """The row of the observation of each state of the model, shape (S,); 0 for unreachable."""
-        assert self.exact is not None
-        rows = np.zeros(self.exact.model.n_states, np.int64)
-        seen = self.exact.observations[self.exact.model.reachable]
-        rows[self.exact.model.reachable] = self.rows(seen.reshape(len(seen), -1))
-        return rows
+        is_number = isinstance(self.env, DiscretizeObservation)
+        return int(observation) if is_number else self.numbering.number(observation)
 
     def observed(self) -> dict[int, Any]:
         """The observation of each reachable state, as the environment gives it."""
@@ -131,9 +122,8 @@ class World:
                 is_over = terminated or truncated
             successes.append(info.get("is_success"))
         told = None if None in successes else np.array(successes, np.bool_)
-        yardstick = bracket_of(self.env) if self.exact is None else self.exact.yardstick
-        returns, lengths = np.array(env.return_queue), np.array(env.length_queue)
-        return Evaluation(returns, lengths, told, None, yardstick)
+        scale = bracket_of(self.env) if self.exact is None else self.exact.yardstick
+        return Evaluation(np.array(env.return_queue), np.array(env.length_queue), told, None, scale)
 
     def map_of(self, actions: Ints, is_blank: Bools) -> str:
         """The map with the action of each state; "?" where ``is_blank``; empty without a map."""
@@ -161,7 +151,7 @@ def world_of(
         UserError: if there is no such environment, or arguments do not fit.
     """
     if env is None:
-        raise UserError("names no environment: give the id of one")
+        raise UserError("no environment is named: give one, as in --env FrozenLake-v1")
     if not isinstance(env, str) and env_kwargs:
         raise UserError("arguments of the environment go with its id, not with an object")
     made = make_env(env, env_kwargs) if isinstance(env, str) else env
@@ -172,6 +162,5 @@ def world_of(
     except MISTAKES as error:
         raise UserError(f"--bins: {one_line(error)}") from error
     told = ", ".join(f"{key} {value}" for key, value in env_kwargs.items())
-    named = type(made.unwrapped).__name__ if made.spec is None else made.spec.id
-    name = env if isinstance(env, str) else named
+    name = type(made.unwrapped).__name__ if made.spec is None else made.spec.id
     return World(f"{name} ({told})" if told else name, made, evaluator_in(made))

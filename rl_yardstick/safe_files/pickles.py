@@ -67,7 +67,6 @@ class Made:
 class Reader(pickle._Unpickler):
     """Python's own pickle reader, changed so that it calls and imports nothing."""
 
-    instructions: ClassVar[frozenset[str]] = INSTRUCTIONS
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
     append: Callable[[Any], None]
     pop_mark: Callable[[], list[Any]]
@@ -84,7 +83,7 @@ class Reader(pickle._Unpickler):
         start = self.file.tell()
         try:
             for instruction, argument, _ in pickletools.genops(self.file):
-                if instruction.name not in self.instructions:
+                if instruction.name not in INSTRUCTIONS:
                     raise UnsafeFileError(f"a pickle with the instruction {instruction.name}")
                 if isinstance(argument, int) and argument.bit_length() > MAX_INTEGER_BITS:
                     raise UnsafeFileError("holds an absurdly large number")

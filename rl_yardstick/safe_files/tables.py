@@ -64,18 +64,15 @@ def read_table_file(source: Source) -> Any:
         raise UnsafeFileError(f"cannot be read: {str(error) or type(error).__name__}") from error
 
 
-# --- pickles --------------------------------------------------------------------------------------
-
-# A defaultdict's maker of missing values is not built.
-_KINDS = ("defaultdict", "OrderedDict", "Counter")
-_DICTIONARIES = {DICTIONARY, *(f"collections.{kind}" for kind in _KINDS)}
+# Of any module, since nothing is called; a defaultdict's maker of missing values is not built.
+_KINDS = (DICTIONARY, "defaultdict", "OrderedDict", "Counter")
 
 
 class TableBuild(Build):
     """Builds tables from records, by keys that are numbers, texts and tuples of them."""
 
     def _make(self, tree: Any) -> Any:
-        if not (isinstance(tree, Made) and tree.name in _DICTIONARIES):
+        if not (isinstance(tree, Made) and tree.name.rpartition(".")[2] in _KINDS):
             return super()._make(tree)
         given = tree.args[0] if tree.args else None
         first = given.items if isinstance(given, Made) and given.name == DICTIONARY else []
@@ -102,9 +99,6 @@ def read_pickled_table(content: bytes, budget: Budget) -> Any:
     return TableBuild(ARRAYS, {}, budget)(tree)
 
 
-# --- NumPy's files, and tensors -------------------------------------------------------------------
-
-
 def _array_file(content: bytes, budget: Budget) -> Any:
     """The array of an .npy file; one of objects holds a pickle."""
     file = io.BytesIO(content)
@@ -127,13 +121,7 @@ def _archive(content: bytes, budget: Budget) -> Any:
 
         found = tensors_in(load_tensors(content, budget))
         return {name: tensor.detach().numpy() for name, tensor in found}
-    if not all(name.endswith(".npy") for name in members):
-        raise UnsafeFileError("is a zip that holds no arrays")
-    arrays = {name.removesuffix(".npy"): held for name, held in members.items()}
-    return {name: _array_file(held, budget) for name, held in arrays.items()}
-
-
-# --- CSV ------------------------------------------------------------------------------------------
+    return {name.removesuffix(".npy"): _array_file(members[name], budget) for name in members}
 
 
 def _rows(text: str, budget: Budget) -> Any:

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from rl_yardstick import mdp
+from rl_yardstick import mdp, rate
 from rl_yardstick.envs import known_models
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.rating import rate
 from tests.pipeline.short_runs import trained
 
 LAKE, DRY = "FrozenLake-v1", {"is_slippery": False}
@@ -128,14 +127,14 @@ def test_hands_of_blackjack_in_every_form():
 
 
 REFUSED = {
-    "another map": (np.zeros((64, 4)), "needs 16 x 4 (states x actions); 64 x 4 is the shape of"),
-    "another game": (np.zeros((500, 6)), "500 x 6 is the shape of Taxi-v4"),
+    "another map": (np.zeros((64, 4)), "64 x 4: FrozenLake-v1 needs 16 x 4 (states x actions)"),
+    "another game": (np.zeros((500, 6)), "500 x 6: FrozenLake-v1 needs 16 x 4"),
     "values of states": (np.linspace(0, 1, 16), "one value of each state"),
     "nan": (np.where(np.eye(16, 4) > 0, np.nan, 1.0), "nan in 4 states"),
     "a state too many": ({s: [0, 0, 0, 1] for s in range(64)}, "([16] is not in Discrete(16)): Fr"),
     "an action too many": ({(0, 9): 1.0, (1, 0): 2.0}, "has an action 9: "),
     "keys of two kinds": ({0: [0] * 4, (1, 2): [0] * 4}, "no state of FrozenLake-v1"),
-    "hands": (hands(), "has keys such as (4, 1, False)"),
+    "hands": (hands(), "[4, 1, 0] is not in Discrete(16)"),
     "ragged": ([[1, 2], [3]], "holds no table"),
     "words": ({0: "left", 1: "right"}, "holds no table"),
     "a number": (3, "is no table"),
@@ -206,8 +205,6 @@ def test_tables_need_no_pytorch_and_files_run_nothing(tmp_path, typed, monkeypat
     assert (code, "score 0 " in out) == (0, True)
     assert "its own code ran" in out
     sys.modules.pop("own", None)
-    light = (
-        f"import numpy, sys\nfrom rl_yardstick.rating import rate\nrate(numpy.eye(16, 4), '{LAKE}')"
-    )
+    light = f"import numpy, sys\nfrom rl_yardstick import rate\nrate(numpy.eye(16, 4), '{LAKE}')"
     code = f"{light}\nsys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

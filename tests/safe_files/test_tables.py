@@ -59,6 +59,15 @@ def test_pickled_forms_in_every_protocol(form):
         assert same(read_pickled_table(content, Budget(len(content))), read), protocol
 
 
+class Counter(dict):
+    """A course's own."""
+
+
+def test_a_counter_of_another_module():
+    content = pickle.dumps(Counter(pairs()))
+    assert same(read_pickled_table(content, Budget(len(content))), pairs())
+
+
 class Mark:
     def __reduce__(self):
         return os.mkdir, ("mark",)
