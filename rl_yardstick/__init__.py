@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import Any
 
 _OF_API = ("Run", "Study", "audit", "compare", "explain", "optimum", "train", "tune")
-_HOMES = dict.fromkeys(_OF_API, "api") | {"judge": "experiments.others", "rate": "rating"}
+_HOMES = dict.fromkeys(_OF_API, "api") | {"judge": "experiments.others", "rate": "rating.ratings"}
 __all__ = list(_HOMES)
 
 

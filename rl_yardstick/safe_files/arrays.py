@@ -1,4 +1,4 @@
-"""Makers of NumPy's arrays, types and numbers in pickles."""
+"""Makers of NumPy's arrays, types and numbers in pickles, and of the bytes in them."""
 
 from __future__ import annotations
 
@@ -52,4 +52,7 @@ ARRAYS: Mapping[str, Maker] = {
     "numpy._core.numeric._frombuffer": _from_buffer,
     "numpy._core.multiarray._reconstruct": _reconstructed,
     "numpy._core.multiarray.scalar": _scalar,
+    # How protocols 0 to 2 hold bytes.
+    "builtins.bytes": lambda made, build: b"".join(made.args),  # of none
+    "_codecs.encode": lambda made, build: build(made.args)[0].encode("latin1"),
 }

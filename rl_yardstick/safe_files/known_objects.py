@@ -223,9 +223,6 @@ _MAKERS: Mapping[str, Maker] = {
     ),
     # Of recurrent agents up to version 2.3, which begin anew with each training.
     "sb3_contrib.common.recurrent.type_aliases.RNNStates": lambda made, build: build(made.args),
-    # How protocols 0 to 2 hold bytes.
-    "builtins.bytes": lambda made, build: b"".join(made.args),  # of none
-    "_codecs.encode": lambda made, build: build(made.args)[0].encode("latin1"),
     "torch.device": lambda made, build: th.device("cpu"),  # the caller chooses
 }
 

@@ -30,7 +30,7 @@ INSTRUCTIONS = frozenset(_NAMES.split())
 # of a sign, since one can make all others of a text four bytes wide.
 _PRICE, _BYTES_PER_SIGN = 160, 4
 MAX_DEPTH, MAX_INTEGER_BITS = 40, 128
-_END_OF_KEYS = (1 << 61) - 1  # larger integers are not their own hash: any number can share one
+END_OF_KEYS = (1 << 61) - 1  # larger integers are not their own hash: any number can share one
 # Packages that were renamed: NumPy's inner one, and Gym, whose spaces Gymnasium took over.
 _RENAMED = {"numpy.core.": "numpy._core.", "gym.spaces.": "gymnasium.spaces."}
 _RENAMED |= {"copy_reg.": "copyreg.", "__builtin__.": "builtins."}  # in protocols 0 to 2
@@ -67,7 +67,6 @@ class Made:
 class Reader(pickle._Unpickler):
     """Python's own pickle reader, changed so that it calls and imports nothing."""
 
-    instructions: ClassVar[frozenset[str]] = INSTRUCTIONS
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
     append: Callable[[Any], None]
     pop_mark: Callable[[], list[Any]]
@@ -84,7 +83,7 @@ class Reader(pickle._Unpickler):
         start = self.file.tell()
         try:
             for instruction, argument, _ in pickletools.genops(self.file):
-                if instruction.name not in self.instructions:
+                if instruction.name not in INSTRUCTIONS:
                     raise UnsafeFileError(f"a pickle with the instruction {instruction.name}")
                 if isinstance(argument, int) and argument.bit_length() > MAX_INTEGER_BITS:
                     raise UnsafeFileError("holds an absurdly large number")
@@ -199,7 +198,7 @@ class Build:
 def pairs(made: Made) -> Iterator[tuple[Any, Any]]:
     """The keys of a dictionary, which are texts and small numbers, and its recorded values."""
     for key, value in zip(made.items[::2], made.items[1::2], strict=True):
-        if not isinstance(key, str | int) or (isinstance(key, int) and abs(key) >= _END_OF_KEYS):
+        if not isinstance(key, str | int) or (isinstance(key, int) and abs(key) >= END_OF_KEYS):
             raise UnsafeFileError("uses something other than texts and numbers as keys")
         yield key, value
 
