@@ -68,7 +68,9 @@ def _of_array(array: NDArray[Any], world: World) -> Table:
     if shape == (n_actions, n):
         note = f"read transposed: it is {by(shape)}, actions x states"
         return _of_values(array.T, np.arange(n), world, note)
-    raise UserError(f"holds a table of shape {by(shape)}: {world.needs()}")
+    lakes = {(16, 4): "4x4", (64, 4): "8x8"} if "FrozenLake" in world.name else {}
+    hint = f"; it fits --env-kwargs map_name:{lakes[shape]}" if shape in lakes else ""
+    raise UserError(f"holds a table of shape {by(shape)}: {world.needs()}{hint}")
 
 
 def _of_actions(actions: NDArray[Any], rows: Ints, world: World) -> Table:

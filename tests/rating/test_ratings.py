@@ -127,7 +127,7 @@ def test_hands_of_blackjack_in_every_form():
 
 
 REFUSED = {
-    "another map": (np.zeros((64, 4)), "64 x 4: FrozenLake-v1 needs 16 x 4 (states x actions)"),
+    "another map": (np.zeros((64, 4)), "(states x actions); it fits --env-kwargs map_name:8x8"),
     "another game": (np.zeros((500, 6)), "500 x 6: FrozenLake-v1 needs 16 x 4"),
     "values of states": (np.linspace(0, 1, 16), "one value of each state"),
     "nan": (np.where(np.eye(16, 4) > 0, np.nan, 1.0), "nan in 4 states"),
