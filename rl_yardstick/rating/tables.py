@@ -35,10 +35,9 @@ def tables_in(content: Any) -> dict[str, Any]:
     found = {"": content}
     if isinstance(content, Mapping) and any(isinstance(k, str) and not key_of(k) for k in content):
         found = {str(key).lower(): value for key, value in content.items()}
-    elif isinstance(content, list | tuple) and all(
-        isinstance(one, Mapping) or getattr(one, "ndim", 0) > 1 for one in content
-    ):
-        found = {str(place): value for place, value in enumerate(content)}
+    elif isinstance(content, list | tuple):
+        tables = [one for one in content if isinstance(one, Mapping) or getattr(one, "ndim", 0) > 1]
+        found = {str(place): one for place, one in enumerate(tables)} or found
     usual = [name for name in USUAL_NAMES if name in found][:1]
     kinds: Any = np.ndarray | list | tuple | Mapping
     found = {name: found[name] for name in usual or found if isinstance(found[name], kinds)}
