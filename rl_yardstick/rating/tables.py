@@ -55,7 +55,9 @@ def as_table(content: Any, world: World) -> Table:
             return _of_mapping(content, world)
         return _of_array(np.asarray(content, np.float64).squeeze(), world)
     except (ValueError, TypeError, OverflowError) as error:
-        raise UserError(f"holds no table ({one_line(error)}): {world.needs()}") from error
+        is_ragged = "inhomogeneous" in str(error)
+        why = "rows of different lengths" if is_ragged else one_line(error)
+        raise UserError(f"holds no table ({why}): {world.needs()}") from error
 
 
 def _of_array(array: NDArray[Any], world: World) -> Table:
