@@ -383,6 +383,7 @@ class TuningSeeds:
     files: Mapping[str, Seeds]  #: likewise, by the name of a user's file that lists seeds
     unknown: tuple[str, ...]  #: agents whose settings have unknown tuning seeds
     elsewhere: tuple[str, ...] = ()  #: agents tuned with other environment arguments
+    of_logs: bool = False  #: whether the runs were done elsewhere
 
 
 def tuning_seeds(study: StudySpec) -> TuningSeeds:
@@ -414,7 +415,7 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
             place, name = files, agent.conf_file.name
         shared = frozenset(seed for seeds in seen for seed in study.seeds if seed in seeds)
         place[name] = place.get(name, frozenset()) | shared
-    return TuningSeeds(shipped, files, tuple(unknown), tuple(elsewhere))
+    return TuningSeeds(shipped, files, tuple(unknown), tuple(elsewhere), bool(study.figure))
 
 
 def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:

@@ -115,6 +115,8 @@ MOST_NAMES = 6  # in the sentence on seeds
 
 def seed_sentence(seeds: range, tuning: TuningSeeds) -> str:
     """Say which of the seeds of a study the settings of its agents were tuned on."""
+    if tuning.of_logs:
+        return "The logs do not say on which seeds settings were tuned."
     these = "these" if len(seeds) > 1 else "it"
     parts = [
         *_tuned(seeds, tuning.shipped, "the shipped settings of", these),
