@@ -146,6 +146,11 @@ def results_of(
         curves += of_run
     hidden = HIDDEN_COLUMNS if any(row["full_optimum"] is not None for row in rows) else ()
     table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *hidden])
+    for name, of_env in table.dropna(subset="n_timesteps").groupby("environment"):
+        steps = of_env.groupby("agent")["n_timesteps"].median()
+        if steps.max() > 1.1 * steps.min():
+            span = f"{steps.min():,.0f} to {steps.max():,.0f} steps"
+            notes.append(f"{name}: agents trained for {span}")
     return StudyResults(study, root, table, joined(curves), tuple(planned))
 
 

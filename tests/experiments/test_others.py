@@ -231,6 +231,11 @@ def test_what_is_assumed_is_told(tmp_path):
     assert "no column of seeds: each part, to where 'global_step' falls," in found.notes[0]
     assert "each row counts as a seed" in judge(table().drop(columns="seed")).notes[0]
     assert "one agent only, good" in " ".join(judge(table().query("agent == 'good'")).notes)
+    rows = [
+        (a, "X", s, n, s) for a, most in (("a", 20), ("b", 30)) for s in (0, 1) for n in (10, most)
+    ]
+    made = pd.DataFrame(rows, columns=["agent", "env", "seed", "step", "return"])
+    assert "X: agents trained for 20 to 30 steps" in judge(made).notes
 
 
 def test_files_that_are_no_logs_are_counted(tmp_path):
