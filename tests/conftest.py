@@ -79,6 +79,18 @@ def signals_are_left_as_they_were():
     assert after == before
 
 
+@pytest.fixture(autouse=True)
+def classes_are_forgotten():
+    """A class that a test registers would be on the pages that other tests make."""
+    from rl_yardstick.agents.registry import ALGORITHMS, BY_VALUE
+
+    before = {*ALGORITHMS}
+    yield
+    for name in ALGORITHMS.keys() - before:
+        del ALGORITHMS[name]
+        BY_VALUE.pop(name, None)
+
+
 def small_study():
     """Three agents, one of them with a name that is an attack, on two maps with two seeds."""
     from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec

@@ -107,7 +107,8 @@ class Browser:
             if message["method"] == "Network.requestWillBeSent"
         ]
         # The browser's own start page may still be loading.
-        own = [url for url in asked if not url.startswith(("data:", "blob:", "chrome:"))]
+        browsers = ("data:", "blob:", "chrome:", "chrome-untrusted:")
+        own = [url for url in asked if not url.startswith(browsers)]
         assert own == [path.as_uri()]
 
     def fits(self, width):
