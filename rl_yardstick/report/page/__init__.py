@@ -40,10 +40,9 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
 def current_files(results: StudyResults, command: str) -> list[Path]:
     """A study's figures and page, if this version made them from the same runs; else none."""
     root, mark = results.root, _mark(results, command).encode()
-    found = [*root.glob("figures/*"), *root.glob("learning/*/*.html"), *root.glob("report.html")]
-    is_whole = len(found) > 1 and found[-1].name == "report.html"
-    is_current = is_whole and found[-1].read_bytes().endswith(mark)
-    return sorted(found, key=lambda path: path.stat().st_mtime_ns) if is_current else []
+    page, drawn = root / "report.html", [*root.glob("figures/*"), *root.glob("learning/*/*.html")]
+    is_current = drawn and page.exists() and page.read_bytes().endswith(mark)
+    return sorted([*drawn, page], key=lambda one: one.stat().st_mtime_ns) if is_current else []
 
 
 def write_report(report: Report, path: Path) -> None:
