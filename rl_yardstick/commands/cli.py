@@ -129,14 +129,12 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 _SEARCH = "hyperparameters are searched by another command: see tune --help"
-_NO_WANDB = "Weights & Biases is not supported; -tb DIR writes TensorBoard logs"
 # Flags of rl_zoo3's train and enjoy that do not exist here, and why.
 _INSTEAD: Mapping[str, str] = {
     **dict.fromkeys(("-optimize", "--optimize-hyperparameters", "--n-trials"), _SEARCH),
     **dict.fromkeys(("--sampler", "--pruner", "--n-startup-trials", "--max-total-trials"), _SEARCH),
     "--optimization-log-path": _SEARCH,
     "--storage": "tune stores the trials in trials.log, in the folder of the search",
-    **dict.fromkeys(("--track", "--wandb-project-name", "--wandb-entity"), _NO_WANDB),
     **dict.fromkeys(("-yaml", "--yaml-file"), "did you mean '--conf-file'?"),
     "--n-evaluations": "give the steps between evaluations: --eval-freq",
     "--trial-id": "tune writes a file for --conf-file, winner.yml",
@@ -304,6 +302,12 @@ def check_tensorboard(wanted: object) -> None:
     """Raise `UserError` if a TensorBoard log is wanted and TensorBoard is not installed."""
     if wanted and importlib.util.find_spec("tensorboard") is None:
         raise UserError("-tb needs: pip install 'rl-yardstick[tensorboard]'")
+
+
+def check_wandb(wanted: bool) -> None:
+    """Raise `UserError` if a run is to be tracked and wandb or TensorBoard is not installed."""
+    if wanted and not all(map(importlib.util.find_spec, ("wandb", "tensorboard"))):
+        raise UserError("--track needs: pip install 'rl-yardstick[wandb]'")
 
 
 def check_device(device: str) -> None:

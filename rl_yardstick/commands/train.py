@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,11 +31,13 @@ if TYPE_CHECKING:
 
 RESUMED = "this run, or the newest unfinished one of --algo and --env"
 PAGE = "learning.html"
+TRACKED = "runs"  # where TensorBoard's files of --track go, as in rl_zoo3
 STORAGE = "hyperparameters of an Optuna trial in sqlite:///FILE or a journal FILE.log"
 WATCH = f"write a page that plays the training ({PAGE} in the run folder)"
 WATCHED = whole_number(1, besides={0: "the steps in which its policy improves"})
 # Flags that may stand beside --resume: none of the training itself.
-_BESIDE_RESUME = {"resume", "log_folder", "gym_packages", "verbose", "progress"}
+_BESIDE_RESUME = {"resume", "log_folder", "gym_packages", "verbose", "progress", "track"}
+_BESIDE_RESUME |= {"wandb_project_name", "wandb_entity", "wandb_group", "wandb_tags"}
 
 EPILOG = """\
 examples:
@@ -75,6 +77,11 @@ FLAGS: Flags = {
         flag("-f --log-folder", "folder of all runs (logs)", default="logs"),
         switch("-uuid --uuid", "add a unique id to the run folder's name"),
         flag("-tb --tensorboard-log", "write TensorBoard logs there", default="", metavar="DIR"),
+        switch("--track", "track the run in Weights & Biases"),
+        flag("--wandb-project-name", "its project", default="sb3", metavar="NAME"),
+        flag("--wandb-entity", "its user or team", metavar="NAME"),
+        flag("--wandb-group", "its group of runs", metavar="NAME"),
+        several("-tags --wandb-tags", "its tags", metavar="TAG"),
         flag("--log-interval", "episodes or rollouts between log records", cli.LOG_INTERVAL, -1),
         flag("--verbose", "0 silent, 1 (default), 2 the library's tables", whole_number(0, 2), 1),
         switch("-P --progress", "a progress bar even without a terminal"),
@@ -136,7 +143,8 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
         try:
             with run.console.status("loading the libraries"):
                 from rl_yardstick.pipeline.training import train
-            outcome = train(spec, run, resumes, print_engine)
+            with tracking(spec, run, args):
+                outcome = train(spec, run, resumes, print_engine)
         except Stopped:
             if run.has_begun:
                 again = cli.to_copy("train", "--resume", run.path)
@@ -145,6 +153,16 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
         if not run.console.quiet:
             print_outcome(run, spec, outcome, args)
     return 0
+
+
+def tracking(spec: TrainSpec, run: Run, args: argparse.Namespace) -> AbstractContextManager[None]:
+    """The run in Weights & Biases, if ``--track`` asks for it."""
+    if not args.track:
+        return nullcontext()
+    from rl_yardstick.pipeline.tracking import tracked
+
+    where = {"project": args.wandb_project_name, "entity": args.wandb_entity}
+    return tracked(run, spec, **where, group=args.wandb_group, tags=args.wandb_tags)
 
 
 # --- from flags to a spec -------------------------------------------------------------------------
@@ -165,6 +183,7 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
     check_agent(args.algo)
     check_env_id(args.env)
     cli.check_tensorboard(args.tensorboard_log)
+    cli.check_wandb(args.track)
     cli.check_device(args.device)
     entry, origins = entry_from_flags(args)
     names = ["eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer"]
@@ -178,7 +197,7 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
         n_threads=args.num_threads,
         trained_agent=whole_zip(Path(args.trained_agent)) if args.trained_agent else None,
         vec_normalize=_statistics(args),
-        tensorboard_log=args.tensorboard_log or None,
+        tensorboard_log=args.tensorboard_log or (TRACKED if args.track else None),
         library_log=args.verbose > 1,
         watch_learning=_page(args),
         map_name=map_name(args.env, entry),
@@ -281,7 +300,10 @@ def resume(run: Run, args: argparse.Namespace) -> int:
     spec = resumable(run.path)
     check_typed(spec.gym_packages, args.gym_packages, str(run.path))
     check_code(spec, str(run.path))
-    return carry_out(spec.changed(gym_packages=args.gym_packages), run, args, resumes=True)
+    cli.check_wandb(args.track)
+    log = spec.tensorboard_log or (TRACKED if args.track else None)
+    spec = spec.changed(gym_packages=args.gym_packages, tensorboard_log=log)
+    return carry_out(spec, run, args, resumes=True)
 
 
 def unfinished_run(args: argparse.Namespace) -> Path:

@@ -179,3 +179,20 @@ def test_a_signal_ends_a_command_and_tells_how_to_resume(type_command, tmp_path)
     record = json.loads((state.parent / "run.json").read_text())
     assert (record["state"], record["stopped_by"]) == ("interrupted", signal.SIGTERM)
     assert (state.parent / "CartPole-v1.zip").exists()
+
+
+def test_a_run_is_tracked_in_weights_and_biases(type_command, tmp_path, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    words = ["-n", "3000", "--seed", "0", "--verbose", "0", "--track", "--wandb-group", "the lake"]
+    code, out, err = type_command("train.py", *LAKE, *words, "-tags", "first", "second")
+    assert (code, out) == (0, ""), err
+    (record,) = tmp_path.glob("logs/qlearning/FrozenLake-v1_1/wandb/offline-run-*/*.wandb")
+    told = record.read_bytes()
+    for word in ("qlearning/FrozenLake-v1_1", "the lake", "second", "learning_rate", "eval/score"):
+        assert word.encode() in told, word
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert type_command("train.py", *LAKE, "--track")[::2] == (
+        2,
+        "train.py: error: --track needs: pip install 'rl-yardstick[wandb]'\n",
+    )
