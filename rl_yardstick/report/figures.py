@@ -544,7 +544,6 @@ def draw_grid(
 
 # The lines of more agents are unreadable; a sweep shows its agents by parameter instead.
 MOST_LINES = 14
-MOST_IN_PAIRS = 8  # the largest number of panels in two columns; more are in three
 
 
 def write_figures(series: StudySeries) -> list[Path]:
