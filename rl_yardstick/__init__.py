@@ -3,8 +3,8 @@
 from importlib import import_module
 from typing import Any
 
-_OF_API = ("Run", "Study", "audit", "compare", "explain", "optimum", "train", "tune")
-_HOMES = dict.fromkeys(_OF_API, "api") | {"judge": "experiments.others", "rate": "rating.ratings"}
+_OF_API = ("Run", "Study", "audit", "compare", "explain", "judge", "optimum", "train", "tune")
+_HOMES = dict.fromkeys(_OF_API, "api") | {"rate": "rating.ratings"}
 __all__ = list(_HOMES)
 
 

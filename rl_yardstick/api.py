@@ -50,7 +50,7 @@ from rl_yardstick.experiments.pool import REGISTRATIONS
 from rl_yardstick.experiments.results import read_evaluations
 from rl_yardstick.pipeline import training
 from rl_yardstick.pipeline.environments import check_env_id, with_files_read
-from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown
+from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown, unknown
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
 from rl_yardstick.pipeline.files import read_json, read_text
 from rl_yardstick.pipeline.models import Wanted, load_agent, model_of_run
@@ -171,6 +171,30 @@ def compare(envs: Any, algos: Any, seeds: int = 10, **settings: Any) -> Study:
     return Study(root, text.getvalue())
 
 
+def judge(
+    what: Any, env: Any = (), columns: Mapping[str, str] | None = None, **settings: Any
+) -> Study:
+    """Judge runs that other programs have done by their logs, as ``compare.py LOGS``.
+
+    ``what`` are files and folders, or a table with a row for each score or step, ``env`` the
+    environment of logs that name none, and ``columns`` a table's own names by the usual ones.
+    """
+    known, text = compare_command.BESIDE_LOGS | {"folder"}, StringIO()
+    if wrong := [name for name in settings if name not in known]:
+        raise unknown("judge has no setting", wrong[0], known)
+    with tempfile.TemporaryDirectory() as folder, _at_work() as (_, stop):
+        paths = what if isinstance(what, list | tuple) else [what]
+        if isinstance(what, pd.DataFrame):
+            paths = [Path(folder) / "table.csv"]
+            what.to_csv(paths[0], index=False)
+        own = [f"{name}={column}" for name, column in (columns or {}).items()]
+        words = [*map(str, paths), *(["--columns", *own] if own else [])]
+        args = _flags(compare_command, env, [], settings, words)
+        console = TextConsole(file=text, width=100, **_PLAIN)
+        root = compare_command.judge_logs(args, args.command, console, stop)
+    return Study(root, text.getvalue())
+
+
 def explain(model: Any, env: Any = None, **env_kwargs: Any) -> Told:
     """Show where an agent loses return against the optimum, as ``explain``.
 
@@ -250,7 +274,9 @@ _NONE |= {"hyperparams", "policy", "logged", "cluster", "until_decided", "max_se
 _PLAIN: Any = {"force_jupyter": False, "force_terminal": False}
 
 
-def _flags(command: Any, envs: Any, algos: Any, settings: Mapping[str, Any]) -> Any:
+def _flags(
+    command: Any, envs: Any, algos: Any, settings: Mapping[str, Any], first: Sequence[str] = ()
+) -> Any:
     """A command's flags from keywords; a keyword that is no flag is a hyperparameter."""
     parser, params = command.build_parser(), dict[str, Any]()
     envs, algos = (one if isinstance(one, list | tuple) else [one] for one in (envs, algos))
@@ -261,8 +287,8 @@ def _flags(command: Any, envs: Any, algos: Any, settings: Mapping[str, Any]) -> 
         given["env_kwargs"] = made[0][1] | given.get("env_kwargs", {})
     if "folder" in given:
         given["log_folder"] = given.pop("folder") or tempfile.mkdtemp(prefix="yardstick-")
-    words = ["--env", *ids] if ids else []
-    words += ["--algos" if "algos" in flags else "--algo", *names]
+    words = [*first, *(["--env", *ids] if ids else [])]
+    words += ["--algos" if "algos" in flags else "--algo", *names] if names else []
     for key, value in given.items():
         if key not in flags or key in _NONE:
             params[key] = value

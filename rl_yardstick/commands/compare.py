@@ -121,16 +121,18 @@ def main() -> int:
     cli.import_typed(args)
     if args.logged or args.policy:
         return compare_on_log(args)
+    from rl_yardstick.commands.terminal import table_console
     from rl_yardstick.experiments.study import METRICS
 
     if args.metric is not None and args.metric not in METRICS:
         raise unknown("--metric: unknown metric", args.metric, METRICS)
     if is_logs(args.study):
-        return judge_logs(args, stop)
+        cli.check_alone(build_parser(), BESIDE_LOGS, "logs: their runs are finished")
+        judge_logs(args, cli.command_line(), table_console(), stop)
+        return 0
     if args.pattern or args.columns:
         raise UserError("--pattern and --columns belong to logs: name their folders or files")
-    from rl_yardstick.commands.terminal import table_console
-    from rl_yardstick.experiments.plan import StudyRecord, specs_of
+    from rl_yardstick.experiments.plan import StudyRecord, plan_of_looks, specs_of
 
     if args.resume is not None:
         cli.check_alone(build_parser(), _BESIDE_RESUME)
@@ -146,10 +148,7 @@ def main() -> int:
     job.console.print(record.study.title, style="bold")
     with held(root), workers:
         if args.until_decided:
-            from rl_yardstick.experiments.plan import plan_of_looks
-
-            looks = plan_of_looks(record.study, root, args.max_seeds)
-            record = replace(record, looks=looks)
+            record = replace(record, looks=plan_of_looks(record.study, root, args.max_seeds))
         return carry_out(job, record)
 
 
@@ -163,12 +162,10 @@ def is_logs(words: Sequence[str]) -> bool:
     return bool(words) and not others
 
 
-def judge_logs(args: argparse.Namespace, stop: Stop) -> int:
-    """Judge finished runs by their logs, write tables and page; return the exit code."""
-    cli.check_alone(build_parser(), _BESIDE_LOGS, "logs: their runs are finished")
+def judge_logs(args: argparse.Namespace, command: str, console: Console, stop: Stop) -> Path:
+    """Judge finished runs by their logs; return the folder with tables and page."""
     if len(args.env or ()) > 1:
         raise UserError("--env names the environment of logs that name none: give one")
-    from rl_yardstick.commands.terminal import table_console
     from rl_yardstick.experiments.logs import find_logs
     from rl_yardstick.experiments.others import Options, results_of
     from rl_yardstick.experiments.study import file_name
@@ -179,7 +176,7 @@ def judge_logs(args: argparse.Namespace, stop: Stop) -> int:
     env, metric = (args.env or [Options.env])[0], args.metric or Options.metric
     figures = tuple(args.figures or Options.figures)
     options = Options(args.pattern, columns, env, kwargs, metric, args.margin, figures)
-    console, paths = table_console(), [Path(word) for word in args.study]
+    paths = [Path(word) for word in args.study]
     root = Path(args.log_folder) / (args.name or file_name(paths[0].absolute().stem))
     if (root / "study.json").exists():
         raise UserError(f"{root} is a study's folder: give another one by --name NAME")
@@ -190,9 +187,8 @@ def judge_logs(args: argparse.Namespace, stop: Stop) -> int:
         console.print(line)
     workers = workers_of(args, root, None)
     with held(root), workers:
-        job = Job(root, cli.command_line(), console, stop, workers, not args.no_report)
-        _judge(job, results, ())
-    return 0
+        _judge(Job(root, command, console, stop, workers, not args.no_report), results, ())
+    return root
 
 
 @dataclass(frozen=True)
@@ -423,7 +419,7 @@ def _draw(job: Job, analysis: StudyAnalysis) -> list[Path]:
 
 # --- from flags to a study ------------------------------------------------------------------------
 
-_BESIDE_LOGS = {
+BESIDE_LOGS = {
     *("study", "pattern", "columns", "env", "env_kwargs", "gym_packages", "metric", "margin"),
     *("name", "log_folder", "figures", "no_report", "jobs"),
 }

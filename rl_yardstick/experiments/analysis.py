@@ -233,7 +233,6 @@ class AgentAnalysis:
 
     agent: str  #: its label
     runs: AgentRuns  #: its runs as the verdicts compare them
-    judged: Estimate  #: the mean of what the verdicts compare: scores, or else the metric
     spread: float  #: the standard deviation of these over runs
     n_runs: int  #: finished runs
     n_missing: int  #: unfinished runs
@@ -257,11 +256,6 @@ class AgentAnalysis:
     discounted: Estimate | None = None
     discount: float | None = None
     discounted_optimum: float | None = None
-
-    @property
-    def on_variant(self) -> bool:
-        """Whether its training returns are of a changed environment, and cannot be compared."""
-        return bool(self.changes)
 
     @property
     def marked(self) -> str:
@@ -387,10 +381,7 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
     def known(column: str, bounds: Bounds = UNBOUNDED) -> Estimate | None:
         return mean(column, bounds) if table[column].notna().any() else None
 
-    compared = evidence.scores[agent]
-    finite = compared[np.isfinite(compared)]
-    bounds = UNIT if evidence.is_score else evidence.bounds
-    judged = mean_over_runs(-compared if evidence.is_cost else compared, bounds)
+    finite = evidence.scores[agent][np.isfinite(evidence.scores[agent])]
     optimum, baseline, score = evidence.optimum, evidence.baseline, None
     if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
         score = mean_over_runs(np.clip(values("score"), 0, 1), UNIT)
@@ -400,7 +391,6 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
     return AgentAnalysis(
         agent=agent,
         runs=runs,
-        judged=judged,
         spread=float(finite.std(ddof=1)) if len(finite) > 1 else 0.0,
         n_runs=len(table),
         n_missing=n_seeds - len(table),

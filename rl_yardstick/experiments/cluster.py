@@ -56,7 +56,7 @@ class ClusterWorkers(Workers):
     def submit(self, planned: PlannedRun, command: str) -> Future[None]:
         """Do a run as soon as a worker is free."""
         given = planned, command, str(Path.cwd()), self.timeout
-        future: Future[None] = self._executor.submit(_do_run, *given)
+        future: Future[None] = self._client.get_executor(pure=False).submit(_do_run, *given)
         self.n_at_once = 2 * max(len(self._client.scheduler_info(-1)["workers"]), 1)
         return future
 
@@ -66,10 +66,6 @@ class ClusterWorkers(Workers):
             self._client.close(timeout=5)
         if self._cluster is not None:
             self._cluster.close(timeout=30)
-
-    @cached_property
-    def _executor(self) -> Any:
-        return self._client.get_executor(pure=False)
 
     @cached_property
     def _client(self) -> Any:

@@ -1,4 +1,4 @@
-"""Judges runs that were done elsewhere, from their logs, as the runs of a study are judged."""
+"""Runs that were done elsewhere as the runs of a study, from their logs."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
-from html import escape
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import pandas as pd
 
-from rl_yardstick.experiments.analysis import StudyAnalysis, analyse
-from rl_yardstick.experiments.logs import WORDS, Log, find_logs, table_logs
+from rl_yardstick.experiments.logs import WORDS, Log
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.results import (
     HIDDEN_COLUMNS,
@@ -191,54 +189,3 @@ def _read(
     row = summary_row(study, run, recorded, episodes, curve)
     row |= {"agent": run.agent, "environment": run.environment, "path": log.place}
     return {**row, "env_id": run.spec.env_id}, curve, training_curve(run, episodes)
-
-
-# --- in Python ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """The judgement of runs that were done elsewhere."""
-
-    analysis: StudyAnalysis  #: all figures and verdicts
-    notes: list[str]  #: on what was read, left out and assumed
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """A row for each agent on each environment, the best first; ``n`` counts its runs."""
-        rows = [
-            {"environment": one.environment, "agent": agent.agent, **asdict(agent.metric.mean)}
-            | {"score": agent.score and agent.score.point, "optimum": one.optimum}
-            for one in self.analysis.environments
-            for agent in one.agents
-        ]
-        return pd.DataFrame(rows).rename(columns={"point": "mean"}).dropna(axis=1, how="all")
-
-    @property
-    def verdicts(self) -> pd.DataFrame:
-        """A row for each pair of agents, the word on the first, the difference of the means."""
-        pairs = [pair for one in self.analysis.environments for pair in one.pairs]
-        return pd.DataFrame([{"verdict": pair.text, **asdict(pair)} for pair in pairs])
-
-    def _repr_html_(self) -> str:
-        tables = [table.to_html(index=False, na_rep="") for table in (self.table, self.verdicts)]
-        return "".join([*tables, *(f"<p>{escape(note)}</p>" for note in self.notes)])
-
-
-def judge(what: pd.DataFrame | str | Path | Sequence[str | Path], **options: Any) -> Judgement:
-    """Judge runs by their logs, or by a table with a row for each score or step.
-
-    Args:
-        what: the table, or files and folders.
-        options: the fields of `Options`.
-
-    Raises:
-        UserError: if nothing was found, or labels are missing or not unique.
-    """
-    chosen, notes = Options(**options), list[str]()
-    if isinstance(what, pd.DataFrame):
-        logs = table_logs(what, Path("table"), chosen.columns, notes)
-    else:
-        paths = [what] if isinstance(what, str | Path) else what
-        logs, notes = find_logs([Path(path) for path in paths], chosen.columns)
-    return Judgement(analyse(results_of(logs, notes, chosen, Path("runs"))), notes)

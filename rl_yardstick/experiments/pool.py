@@ -13,11 +13,11 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache, partial
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from pebble import ProcessExpired, ProcessPool
 from rich.console import Console
@@ -107,7 +107,7 @@ def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
 # --- workers on this machine ----------------------------------------------------------------------
 
 
-class Workers:
+class Workers(AbstractContextManager["Workers"]):
     """Processes of this machine that do runs, one after another, until the ``with`` ends.
 
     Attributes:
@@ -125,9 +125,6 @@ class Workers:
         self.words = f"{n_at_once} at once"
         self._pool: ProcessPool | None = None
         self._under_way: list[Future[None]] = []
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.end()

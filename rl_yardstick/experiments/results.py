@@ -22,15 +22,7 @@ from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.evaluation.yardstick import with_memory
 from rl_yardstick.pipeline.files import read_arrays, read_bytes
 from rl_yardstick.pipeline.run import MEANINGS, RECORD
-from rl_yardstick.verdicts import (
-    UNBOUNDED,
-    Band,
-    Bounds,
-    curve_band,
-    on_grid,
-    shared_grid,
-    steps_to_threshold,
-)
+from rl_yardstick.verdicts import steps_to_threshold
 
 # --- the files of one run -------------------------------------------------------------------------
 
@@ -145,13 +137,8 @@ def _labels(planned: PlannedRun, kind: str) -> Curve:
 
 def joined(curves: Sequence[Curve]) -> pd.DataFrame:
     """The curves as one table."""
-    lengths = [len(curve["step"]) for curve in curves]
-    columns = {name: [curve[name] for curve in curves] for name in CURVE_COLUMNS if curves}
-    found = {
-        name: np.repeat(values, lengths) if name in _LABELS else np.concatenate(values)
-        for name, values in columns.items()
-    }
-    return pd.DataFrame(found, columns=list(CURVE_COLUMNS))
+    tables = [pd.DataFrame(curve) for curve in curves if len(curve["step"])]
+    return pd.concat(tables or [pd.DataFrame(columns=list(CURVE_COLUMNS))], ignore_index=True)
 
 
 # --- the results of runs --------------------------------------------------------------------------
@@ -396,37 +383,6 @@ def tried(results: StudyResults) -> list[Tried]:
     ranks = {change: rank for rank, change in enumerate(unchanged)}
     found = [Tried(change, values) for change, values in returns.items()]
     return sorted(found, key=lambda one: (ranks.get(one.change, len(ranks)), -one.mean))
-
-
-def curves_by_agent(
-    results: StudyResults, environment: str
-) -> dict[tuple[str, str], list[pd.DataFrame]]:
-    """The learning curves of runs on an environment, by agent and kind."""
-    table = results.curves[results.curves["environment"] == environment]
-    found: dict[tuple[str, str], list[pd.DataFrame]] = {}
-    for (agent, kind, _), rows in table.groupby(["agent", "kind", "seed"]):
-        found.setdefault((str(agent), str(kind)), []).append(rows)
-    return found
-
-
-def mean_curve(
-    curves: Sequence[pd.DataFrame], by: str, bounds: Bounds = UNBOUNDED
-) -> tuple[Floats, Band] | None:
-    """The mean of curves of `curves_by_agent`, by ``"step"``, ``"episode"`` or ``"seconds"``.
-
-    Returns:
-        The points, shape (n,), and the means there with intervals; None without runs, or if a run
-        ended before the first point of another one.
-    """
-    runs = [
-        (np.asarray(rows[by], dtype=np.float64), np.asarray(rows["value"], dtype=np.float64))
-        for rows in curves
-    ]
-    if not runs or max(points[0] for points, _ in runs) > min(points[-1] for points, _ in runs):
-        return None
-    grid = shared_grid([points for points, _ in runs], TRAINING_POINTS)
-    values = np.array([on_grid(points, returns, grid) for points, returns in runs])
-    return grid, curve_band(values, bounds)
 
 
 def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import re
-import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import cache, partial
@@ -44,7 +43,6 @@ def markdown_text(text: str) -> str:
 
 
 _PREAMBLE = r"% Taken in by \input; above it: \usepackage{booktabs,graphicx}"
-_FOREIGN = "% With XeLaTeX or LuaLaTeX, and a font that has these signs: "
 _MINUS = "\N{MINUS SIGN}"
 _SIGNS = {
     "\\": r"\textbackslash{}",
@@ -65,10 +63,13 @@ _SIGNS = {
     _MINUS: "$-$",
     "…": r"\ldots{}",
     "†": r"$\dagger$",
+    # The symbols of settings.
+    "α": r"$\alpha$",
+    "γ": r"$\gamma$",
+    "ε": r"$\varepsilon$",
+    "λ": r"$\lambda$",
+    "κ": r"$\kappa$",
 }
-_GREEK = "ALPHA BETA GAMMA DELTA EPSILON ZETA ETA THETA KAPPA LAMDA MU NU XI PI RHO SIGMA TAU PHI "
-_GREEK += "CHI PSI OMEGA"
-_NOT_IN_OT1 = "ÐÞðþ«»"  # Latin-1 characters that pdfLaTeX prints in other font encodings only
 _BEFORE_A_NUMBER = re.compile(r"(?<![\w.)\]}-])-(?=[\d.∞])")
 # LaTeX joins two hyphens, commas or apostrophes into one character. At the start of a row or an
 # item it reads a bracket or an asterisk as an argument of the command before.
@@ -80,15 +81,7 @@ def latex_text(text: str) -> str:
     """Escape a text for LaTeX, on one line; the engine must know its letters."""
     line = _BEFORE_A_NUMBER.sub(_MINUS, " ".join(visible(text).split()))
     line = _LIGATURES.sub("\0", _COMMAND_ARGUMENT.sub(lambda found: f"\0{found[0]}", line))
-    return "".join("{}" if sign == "\0" else _SIGNS.get(sign) or _letter(sign) for sign in line)
-
-
-def _letter(sign: str) -> str:
-    """The LaTeX command of a small Greek letter; any other character unchanged."""
-    greek, _, name = unicodedata.name(sign, "").partition(" SMALL LETTER ")
-    if greek != "GREEK" or name not in _GREEK.split():
-        return sign
-    return f"$\\{ {'LAMDA': 'lambda', 'EPSILON': 'varepsilon'}.get(name, name.lower()) }$"
+    return "".join("{}" if sign == "\0" else _SIGNS.get(sign, sign) for sign in line)
 
 
 def _latex_name(label: str) -> str:
@@ -159,11 +152,7 @@ def verdicts_as(markup: Markup, analysis: StudyAnalysis, command: str) -> str:
             for one in analysis.environments
         ],
     )
-    if markup == "md":
-        return content
-    foreign = sorted({sign for sign in content if ord(sign) > 0xFF or sign in _NOT_IN_OT1})
-    preamble = [_PREAMBLE, *([_FOREIGN + " ".join(foreign)] if foreign else [])]
-    return "\n".join([*preamble, "", content])
+    return content if markup == "md" else f"{_PREAMBLE}\n\n{content}"
 
 
 def table_as(markup: Markup, table: Table) -> str:
@@ -211,7 +200,7 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
     for agent in environment.agents:
         figure = number(agent.metric.mean.point)
         if environment.is_score:
-            figure = score_number(agent.judged.point)
+            figure = score_number(agent.runs.mean)
         cost = costs.get((agent.agent, environment.environment))
         spread, runs = number(float(f"{agent.spread:.2g}")), agent.runs
         notes = "" if spread == "0" else f" ± {spread}"

@@ -171,13 +171,11 @@ def _figure_of(axes: Axes) -> Figure:
     return found
 
 
-def band_words(n_curves: int) -> str:
-    """The legend's entry for the shaded intervals of ``n_curves`` curves."""
-    return "95 % interval" + (f", of the first {MOST_BANDS}" if n_curves > MOST_BANDS else "")
+def shared_legend(*places: Axes, n_bands: int = 0) -> None:
+    """Add one legend for all axes below the figure, and make the figure higher for it.
 
-
-def shared_legend(*places: Axes, band: str = "") -> None:
-    """Add one legend for all axes below the figure, and make the figure higher for it."""
+    ``n_bands`` curves have shaded intervals, or the first `MOST_BANDS` of them.
+    """
     named = [axes.get_legend_handles_labels() for axes in places]
     found = {name: handle for some in named for handle, name in zip(*some, strict=True)}
     if not found:
@@ -185,7 +183,9 @@ def shared_legend(*places: Axes, band: str = "") -> None:
     # Agents before references.
     grey = {name for name in found if getattr(found[name], "get_color", str)() == REFERENCE}
     found = {name: found[name] for name in sorted(found, key=grey.__contains__)}
-    found |= {band: Patch(color=REFERENCE, alpha=0.2, linewidth=0)} if band else {}
+    if n_bands:
+        band = "95 % interval" + (f", of the first {MOST_BANDS}" if n_bands > MOST_BANDS else "")
+        found[band] = Patch(color=REFERENCE, alpha=0.2, linewidth=0)
     figure = _figure_of(places[0])
     names = [wrapped(name, figure.get_figwidth() / 2 - 0.8) for name in found]
     lines = [name.split("\n") for name in names]
@@ -373,7 +373,7 @@ def draw_learning_curves(places: Sequence[Axes], one: EnvironmentSeries, marks: 
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     if on_variant:  # the legend's entry for the circles
         places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
-    shared_legend(*places, band=band_words(len(environment.agents)))
+    shared_legend(*places, n_bands=len(environment.agents))
 
 
 MOST_POWERS = 12  # powers of ten on an axis
@@ -416,12 +416,13 @@ def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
 
 def draw_runs(axes: Axes, one: EnvironmentSeries, study: StudySpec, marks: Marks) -> None:
     """Each run as a dot, the mean with its interval; the best agent on top."""
-    runs, environment = one.runs, one.environment
-    upwards = runs[::-1]
-    for row, agent in enumerate(upwards):
-        colour, mean, n = COLOURS[marks[agent.agent].colour], agent.mean, len(agent.values)
+    environment, upwards = one.environment, one.environment.agents[::-1]
+    means = [agent.metric.mean for agent in upwards]
+    for row, (agent, mean) in enumerate(zip(upwards, means, strict=True)):
+        colour, values = COLOURS[marks[agent.agent].colour], environment.values[agent.agent]
+        n = len(values := values[np.isfinite(values)])
         spread = np.linspace(-0.18, 0.18, n) if n > 1 else np.zeros(n)
-        axes.plot(agent.values, row + spread, ".", color=colour, alpha=0.5, markersize=5)
+        axes.plot(values, row + spread, ".", color=colour, alpha=0.5, markersize=5)
         bar = "D" if mean.low == mean.high else "-"  # a bar of no length is invisible
         axes.plot([mean.low, mean.high], [row, row], bar, color=colour, lw=5, ms=7, alpha=0.35)
         axes.plot([mean.point], [row], "|", color=colour, markersize=16, markeredgewidth=1.5)
@@ -438,10 +439,10 @@ def draw_runs(axes: Axes, one: EnvironmentSeries, study: StudySpec, marks: Marks
                 axes.axvline(end, color=REFERENCE, linewidth=1)
         title += "; the line is the optimum" if at_least is None else _BETWEEN
         title += "" if environment.optimum_is_proven else " (the upper one is not proven)"
-    ends = "range" if all(a.mean.is_range for a in runs) else "95 % interval"
+    ends = "range" if all(mean.is_range for mean in means) else "95 % interval"
     x = f"{study.metric_words}; mean, {ends}, each seed"
-    x += "; diamond: all runs are equal" if any(a.mean.low == a.mean.high for a in runs) else ""
-    title += f"; best: {environment.best}" if len(runs) > 1 else ""
+    x += "; diamond: all runs are equal" if any(m.low == m.high for m in means) else ""
+    title += f"; best: {environment.best}" if len(means) > 1 else ""
     widest = max(width_of(line) for name in names for line in name.split("\n"))
     lettering(axes, title=title, x=x, beside=widest + 0.3)
 
@@ -480,7 +481,7 @@ def draw_sweeps(axes: Axes, one: EnvironmentSeries, metric: str) -> None:
     across = names[0] if len(names) == 1 else "value of the parameter"
     lettering(axes, title=environment.environment, x=across + words, y=METRIC_WORDS[metric])
     is_there = any(np.isfinite(sweep.means.low).any() for sweep in sweeps.values())
-    shared_legend(axes, band=band_words(len(sweeps)) if is_there else "")
+    shared_legend(axes, n_bands=len(sweeps) if is_there else 0)
 
 
 def _ticks_apart(axes: Axes, values: Floats) -> list[float]:
@@ -514,8 +515,8 @@ def draw_grid(
     """The means over two swept parameters as a heat map, the best in frames."""
     shares = grid.shares(is_cost=metric in COSTS)  # the lighter the better
     colours = mpl.colormaps["viridis"](0.1 + 0.85 * shares)
-    across, down = (np.arange(-0.5, n) for n in grid.means.shape[::-1])  # edges of the cells
-    axes.pcolormesh(across, down, colours, edgecolor="white", linewidth=1)
+    edges = (np.arange(-0.5, n) for n in grid.means.shape[::-1])
+    axes.pcolormesh(*edges, colours, edgecolor="white", linewidth=1)
     best = with_best_mean(environment, *grid.labels)
     for (row, column), mean in np.ndenumerate(grid.means):
         if not np.isnan(mean):
@@ -528,8 +529,12 @@ def draw_grid(
     axes.invert_yaxis()
     axes.grid(visible=False)
     turned = 90 if len(grid.across) > UPRIGHT else 0
-    axes.set_xticks(range(len(grid.across)), list(map(_brief, grid.across)), rotation=turned)
-    axes.set_yticks(range(len(grid.down)), list(map(_brief, grid.down)))
+    across, down = (  # in at most two lines
+        [wrapped(v if len(v) <= LONGEST else f"{v[: LONGEST - 1]}…", 1.0) for v in values]
+        for values in (grid.across, grid.down)
+    )
+    axes.set_xticks(range(len(across)), across, rotation=turned)
+    axes.set_yticks(range(len(down)), down)
     axes.tick_params(length=0)
     y, x = grid.parameters
     frames = "a frame" if len(best) == 1 else "frames"
@@ -537,14 +542,8 @@ def draw_grid(
     lettering(axes, title=title, x=x, y=y, beside=1.8)
 
 
-def _brief(text: str) -> str:
-    """A value on an axis, in at most two lines."""
-    return wrapped(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…", 1.0)
-
-
 # The lines of more agents are unreadable; a sweep shows its agents by parameter instead.
 MOST_LINES = 14
-MOST_IN_PAIRS = 8  # the largest number of panels in two columns; more are in three
 
 
 def write_figures(series: StudySeries) -> list[Path]:

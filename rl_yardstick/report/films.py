@@ -1,12 +1,12 @@
 """Films of agents: how a GIF is written, and which episodes of a study are filmed.
 
-Filming loads PyTorch. A study's own process does not: it calls `films_of` in a child process.
+Filming loads PyTorch. A study's own process does not: it calls `film_of` in a child process.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,11 +54,6 @@ def _as_gif(frames: list[Any]) -> bytes:
     duration, film = 1000 // FRAMES_PER_SECOND, io.BytesIO()
     first.save(film, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
     return film.getvalue()
-
-
-def films_of(runs: Sequence[PlannedRun]) -> list[Path | None]:
-    """The film of each run, made if it is missing, see `film_of`."""
-    return [film_of(run) for run in runs]
 
 
 def film_of(planned: PlannedRun) -> Path | None:

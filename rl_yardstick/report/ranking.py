@@ -11,7 +11,6 @@ import numpy as np
 
 from rl_yardstick.experiments.analysis import AgentAnalysis, EnvironmentAnalysis
 from rl_yardstick.experiments.bandits import QUANTILES, PullStatistics
-from rl_yardstick.experiments.study import COSTS, StudySpec
 from rl_yardstick.report.words import Format, interval, interval_alone, number, score_number
 from rl_yardstick.verdicts import Estimate, ThresholdSummary
 
@@ -86,10 +85,6 @@ class Column:
     best_first: Order | None = None
     terminal: str = ""  # its heading in the terminal
 
-    def order(self, study: StudySpec) -> Order:
-        """The order that puts the best first in a study."""
-        return self.best_first or ("ascending" if study.metric in COSTS else "descending")
-
 
 def filled(columns: Sequence[Column], rows: Sequence[Row]) -> list[tuple[Column, list[Cell]]]:
     """The columns that apply to some row, each with a cell for every row."""
@@ -156,7 +151,7 @@ def _training(row: Row) -> Cell | None:
     if math.isnan(row.agent.last_episodes.point):
         return None
     cell = estimate_cell(row.agent.last_episodes)
-    return replace(cell, in_line=f"{cell.in_line} *") if row.agent.on_variant else cell
+    return replace(cell, in_line=f"{cell.in_line} *") if row.agent.changes else cell
 
 
 def _runs(row: Row) -> Cell:

@@ -16,17 +16,11 @@ from scipy import special
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.bandits import QUANTILES, PullStatistics
-from rl_yardstick.experiments.results import (
-    StudyResults,
-    curves_by_agent,
-    mean_curve,
-    read_episodes,
-    values_over_seeds,
-)
+from rl_yardstick.experiments.results import TRAINING_POINTS, StudyResults, read_episodes
 from rl_yardstick.experiments.study import AgentSpec, StudySpec, symbol
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.verdicts import UNBOUNDED, Bounds, Estimate
+from rl_yardstick.verdicts import UNBOUNDED, Bounds, curve_band, on_grid, shared_grid
 
 # From this ratio on, the largest values flatten the rest of a linear axis: two decades.
 DWARFED = 100
@@ -130,8 +124,11 @@ def learning_curves(results: StudyResults, one: EnvironmentAnalysis) -> dict[str
     here = [run.spec for run in results.planned if run.environment == one.environment]
     by_episode = here and all(spec.n_timesteps is None for spec in here)
     agents = [agent.agent for agent in one.agents]
-    variants = tuple(agent.agent for agent in one.agents if agent.on_variant)
-    runs = curves_by_agent(results, one.environment)
+    variants = tuple(agent.agent for agent in one.agents if agent.changes)
+    table = results.curves[results.curves["environment"] == one.environment]
+    runs: dict[Any, list[pd.DataFrame]] = {}
+    for (agent, kind, _), rows in table.groupby(["agent", "kind", "seed"]):
+        runs.setdefault((agent, kind), []).append(rows)
     found = {}
     for kind in KINDS:
         # Training returns of a changed environment have other bounds.
@@ -151,12 +148,13 @@ def learning_curves(results: StudyResults, one: EnvironmentAnalysis) -> dict[str
 
 
 def mean_of(runs: Sequence[pd.DataFrame], by: str, bounds: Bounds = UNBOUNDED) -> Curve | None:
-    """The mean curve of an agent over its runs; None without runs that overlap."""
-    found = mean_curve(runs, by, bounds)
-    if found is None:
+    """The mean of an agent's runs by step, episode or seconds; None without runs that overlap."""
+    curves = [rows[[by, "value"]].to_numpy(np.float64).T for rows in runs]
+    if not curves or max(x[0] for x, _ in curves) > min(x[-1] for x, _ in curves):
         return None
-    points, band = found
-    return Curve(points, band.point, band.low, band.high)
+    grid = shared_grid([x for x, _ in curves], TRAINING_POINTS)
+    band = curve_band([on_grid(x, y, grid) for x, y in curves], bounds)
+    return Curve(grid, band.point, band.low, band.high)
 
 
 def linear_up_to(curves: Iterable[Floats], optimum: float | None) -> float | None:
@@ -263,12 +261,9 @@ def lai_robbins_slope(means: ArrayLike) -> float:
 
 def best_of_normals(n: int) -> float:
     """The expected maximum of ``n`` independent standard normal variables."""
-    from scipy.integrate import quad
+    from scipy import stats
 
-    def weighted(x: float) -> Any:
-        return x * n * (np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)) * special.ndtr(x) ** (n - 1)
-
-    return float(quad(weighted, -np.inf, np.inf)[0])
+    return float(stats.norm.expect(lambda x: x * n * special.ndtr(x) ** (n - 1)))
 
 
 def best_expected_reward(env: gym.Env[object, object]) -> float | None:
@@ -398,16 +393,6 @@ def arm_series(known: Pulls) -> ArmSeries | None:
 
 
 @dataclass(frozen=True)
-class AgentRuns:
-    """The metric of an agent's runs."""
-
-    agent: str  # its label
-    mean: Estimate  # the mean over runs with its interval
-    seeds: Ints  # of the runs, shape (n_runs,)
-    values: Floats  # of the metric, finite, shape (n_runs,)
-
-
-@dataclass(frozen=True)
 class Sweep:
     """Means by the one parameter that an agent was swept over."""
 
@@ -433,17 +418,6 @@ class Grid:
         low, high = known.min(initial=np.inf), known.max(initial=-np.inf)
         shares = (self.means - low) / (high - low if high > low else 1.0)
         return np.asarray(1 - shares if is_cost else shares)
-
-
-def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> list[AgentRuns]:
-    """The metric of each run on an environment; the best agent first."""
-    values = values_over_seeds(results, environment.environment, results.study.metric)
-    found = []
-    for agent in environment.agents:
-        there = np.flatnonzero(np.isfinite(values[agent.agent]))
-        runs, seeds = values[agent.agent][there], there + results.study.first_seed
-        found.append(AgentRuns(agent.agent, agent.metric.mean, seeds, runs))
-    return found
 
 
 def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Sweep]:
@@ -486,7 +460,6 @@ class EnvironmentSeries:
     environment: EnvironmentAnalysis  # how the agents did on it
     # By kind; None for bandits, whose curves are by pull.
     curves: Mapping[str, LearningCurves] | None
-    runs: Sequence[AgentRuns]  # the best agent first
     pulls: PullSeries | None  # on bandits; else None
     sweeps: Mapping[str, Sweep]  # by agent, where it was swept over one parameter
     grids: Mapping[str, Grid] = field(default_factory=dict)  # by agent, where it was swept over two
@@ -509,5 +482,5 @@ def study_series(analysis: StudyAnalysis) -> StudySeries:
         pulls = pull_series(results, one)
         curves = learning_curves(results, one) if pulls is None else None
         swept = sweeps(agents, one), grids(agents, one)
-        environments.append(EnvironmentSeries(one, curves, run_series(results, one), pulls, *swept))
+        environments.append(EnvironmentSeries(one, curves, pulls, *swept))
     return StudySeries(analysis, agent_marks(analysis.study), tuple(environments))

@@ -208,7 +208,7 @@ def folded(name: str, width: int, ends: Sequence[str] = (r"[\s/,]", "[_=-]")) ->
 
 def _caption(study: StudySpec, one: EnvironmentAnalysis, left_out: Sequence[str]) -> list[str]:
     rows = [Row(agent, one) for agent in one.agents]
-    on_variant = any(agent.on_variant for agent in one.agents)
+    on_variant = any(agent.changes for agent in one.agents)
     words = {
         "threshold": number(one.threshold),
         "failed": number(one.failure_threshold),

@@ -316,7 +316,7 @@ def _standing(analysis: StudyAnalysis) -> Iterator[str]:
     what, first = study.metric_words.removeprefix("mean "), learnt[0].agents[0]
     where = f": {number(first.metric.mean.point)}"
     if all(one.is_score for one in learnt):
-        what, where = "score", f": {score_number(first.judged.point)}"
+        what, where = "score", f": {score_number(first.runs.mean)}"
     if len(places) > 1:
         where = f" in {firsts[best[0]]} of {len(places)} environments{each}"
     end = "lowest" if study.metric in COSTS else "highest"
@@ -407,7 +407,7 @@ def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     if len(agents) > 1:
         return f"Best: {environment.best}{optimum}."
     (one,) = agents
-    score = f", score {score_number(one.judged.point)}" if environment.is_score else ""
+    score = f", score {score_number(one.runs.mean)}" if environment.is_score else ""
     return f"{one.agent}: {words} {number(one.metric.mean.point)}{score}{optimum}."
 
 
@@ -453,7 +453,7 @@ def _on_what_cannot_be_compared(
             f"{number(environment.optimum)}: the bracket belongs to another environment, or is "
             f"wrong{'.' if environment.optimum_is_proven else '; its upper end is not proven.'}"
         )
-    names = tuple(agent.agent for agent in environment.agents if agent.on_variant)
+    names = tuple(agent.agent for agent in environment.agents if agent.changes)
     if names and study.metric in OF_TRAINING:
         verb = "was" if len(names) == 1 else "were"
         yield (

@@ -92,7 +92,7 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(typed, own_fo
 def test_films_and_pages_of_training(typed, own_folder, monkeypatch):
     # What takes longest.
     monkeypatch.setattr("rl_yardstick.report.figures.write_figures", lambda *_: [])
-    monkeypatch.setattr("rl_yardstick.report.films.film_of", lambda _: None)
+    monkeypatch.setattr("rl_yardstick.report.page.world_sections.film_of", lambda _: None)
     words = ["--env", "FrozenLake-v1", "--algos", "qlearning", "--n-episodes", 40, "--seeds", 1]
     words += ["-j", 1, "-f", "studies", "--watch-learning", "--render-every", 20]
     code, out, err = typed("compare.py", *words)

@@ -5,6 +5,7 @@ import re
 import shlex
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import gymnasium as gym
 import numpy as np
@@ -15,8 +16,10 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
+import rl_yardstick as ys
+from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.logs import find_logs
-from rl_yardstick.experiments.others import PATTERNS, judge, labels_in
+from rl_yardstick.experiments.others import PATTERNS, Options, labels_in, results_of
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.report.series import learning_curves
 from tests.pipeline.short_runs import trained
@@ -34,6 +37,16 @@ FIGURES = {
 def table(figures=FIGURES, **changes):
     rows = [{"agent": a, "seed": s, "score": value} for (a, s), value in figures.items()]
     return pd.DataFrame(rows).assign(**changes)
+
+
+def judge(what, **settings):
+    with TemporaryDirectory() as folder:
+        return ys.judge(what, folder=folder, no_report=True, **settings)
+
+
+def told(found):
+    """What was printed, without its line ends."""
+    return " ".join(" ".join(found.lines).split())
 
 
 def episodes(value):
@@ -117,10 +130,10 @@ def test_run_folders_are_judged_as_their_numbers_are(tmp_path, write):
         folder = tmp_path / agent / f"Lake-v7_{seed}"
         folder.mkdir(parents=True)
         write(folder, value)
-    found = judge(tmp_path)
-    curves = learning_curves(found.analysis.results, found.analysis.environments[0])
+    results = results_of(*find_logs([tmp_path], {}), Options(), tmp_path)
+    curves = learning_curves(results, analyse(results).environments[0])
     assert {one.budget for one in curves.values()} == {"step"}
-    check(found, "last evaluation" if write is evaluations else "last 100 training")
+    check(judge(tmp_path), "last evaluation" if write is evaluations else "last 100 training")
 
 
 def check(found, words):
@@ -128,8 +141,9 @@ def check(found, words):
     pd.testing.assert_frame_equal(found.table, expected.table)
     pd.testing.assert_frame_equal(found.verdicts, expected.verdicts)
     assert expected.verdicts["verdict"].tolist() == ["better"]
-    assert words in " ".join(found.notes)
-    assert found.analysis.study.n_seeds == 6
+    finals = found.runs.set_index(["agent", "seed"])["final"]
+    assert finals.to_dict() == {(agent, seed - 1): mean for (agent, seed), mean in FIGURES.items()}
+    assert words in told(found)
 
 
 def curves(name, n=3):
@@ -154,15 +168,6 @@ def of_rlberry():
     return pd.concat([times, long.assign(tag="eval_rewards")]).assign(dw_time_elapsed=0.5)
 
 
-def of_wandb():
-    names = {key: f"Lake-v7__{key[0]}__{key[1]}__1700000000" for key in FIGURES}
-    found = {"Step": [100, 200, 300]}
-    for key, value in FIGURES.items():
-        for end in ("", "__MIN", "__MAX"):
-            found[f"{names[key]} - charts/ep_rew_mean{end}"] = [1.0, np.nan, value]
-    return pd.DataFrame(found)
-
-
 @pytest.mark.parametrize(
     ("made", "words"),
     [
@@ -172,7 +177,6 @@ def of_wandb():
         (curves("rollout/ep_rew_mean"), "last 100 training"),
         (episodes_table(), "last 100 training"),
         (of_rlberry(), "last evaluation"),
-        (of_wandb(), "last 100 training"),
     ],
 )
 def test_tables_are_judged_as_their_numbers_are(tmp_path, made, words):
@@ -189,22 +193,25 @@ def test_a_table_of_one_run_has_the_labels_of_its_path(tmp_path):
 
 def test_columns_are_those_that_are_named(tmp_path):
     made = table().rename(columns={"agent": "who", "score": "points"})
-    assert "points" in " ".join(judge(made, columns={"agent": "who", "score": "points"}).notes)
+    assert "run: points" in told(judge(made, columns={"agent": "who", "score": "points"}))
     with pytest.raises(UserError, match=r"no known column of returns \(who, seed, points\)"):
         judge(made)
     with pytest.raises(UserError, match="no column 'whom': did you mean 'who'"):
         judge(made, columns={"agent": "whom"})
+    with pytest.raises(UserError, match="judge has no setting 'margins'"):
+        judge(made, margins=1)
 
 
 def test_scores_are_on_the_scale_where_the_environment_is_known():
     """FrozenLake without slipping: the optimum is 1, and constant actions never arrive."""
     figures = {key: value / 10 for key, value in FIGURES.items()}
     found = judge(table(figures, env="FrozenLake-v1"), env_kwargs={"is_slippery": False})
-    one = found.analysis.environments[0]
-    assert one.optimum == 1.0
-    scores = [(row - one.baseline) / (1 - one.baseline) for row in found.table["mean"]]
-    assert found.table["score"].tolist() == pytest.approx(scores)
-    assert "optimum" not in judge(table(figures, env="OtherLake-v1")).table
+    assert set(found.runs["optimum"]) == {1.0}
+    baseline = found.runs["baseline"][0]
+    means = [np.mean([figures[a, s] for s in range(1, 7)]) for a in found.table["name"]]
+    scores = [(mean - baseline) / (1 - baseline) for mean in means]
+    assert found.table["mean"].tolist() == pytest.approx(scores)
+    assert judge(table(figures, env="OtherLake-v1")).runs["optimum"].isna().all()
 
 
 @pytest.mark.parametrize(
@@ -228,14 +235,14 @@ def test_what_is_assumed_is_told(tmp_path):
     unseeded = curves("return").drop(columns="run")
     found = judge(unseeded)
     assert found.table["n"].tolist() == [6, 6]
-    assert "no column of seeds: each part, to where 'global_step' falls," in found.notes[0]
-    assert "each row counts as a seed" in judge(table().drop(columns="seed")).notes[0]
-    assert "one agent only, good" in " ".join(judge(table().query("agent == 'good'")).notes)
+    assert "no column of seeds: each part, to where 'global_step' falls," in told(found)
+    assert "each row counts as a seed" in told(judge(table().drop(columns="seed")))
+    assert "one agent only, good" in told(judge(table().query("agent == 'good'")))
     rows = [
         (a, "X", s, n, s) for a, most in (("a", 20), ("b", 30)) for s in (0, 1) for n in (10, most)
     ]
     made = pd.DataFrame(rows, columns=["agent", "env", "seed", "step", "return"])
-    assert "X: agents trained for 20 to 30 steps" in judge(made).notes
+    assert "X: agents trained for 20 to 30 steps" in told(judge(made))
 
 
 def test_files_that_are_no_logs_are_counted(tmp_path):
@@ -279,7 +286,7 @@ def test_files_of_strangers_import_no_module(tmp_path, monkeypatch):
         found = judge(table(env="Taken-v0"))
     finally:
         gym.registry.pop("Taken-v0")
-    assert found.analysis.environments[0].env_id == ""
+    assert found.runs["env_id"].isna().all()
     folder = tmp_path / "ppo" / "Lake-v7_1"
     folder.mkdir(parents=True)
     old_monitor(folder, 3.0)

@@ -29,7 +29,6 @@ def agent(label, mean, **changes):
     figures = AgentAnalysis(
         agent=label,
         runs=AgentRuns("lake", label, 4, 0, mean / 100, ends, mean / 100, 0, ends, 0.5),
-        judged=estimate(mean / 100),
         spread=0.0,
         n_runs=4,
         n_missing=0,

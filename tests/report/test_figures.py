@@ -15,7 +15,6 @@ from rl_yardstick.experiments.analysis import OverallAnalysis
 from rl_yardstick.report.figures import write_figures
 from rl_yardstick.report.series import (
     COLOURS,
-    AgentRuns,
     ArmSeries,
     Belief,
     Curve,
@@ -54,17 +53,16 @@ def curves_of(names, linear_up_to=None, on_variant=()):
 
 
 def runs_of(names):
-    some = {0: [85.0, 90, 95], 1: [40.0]}
-    return [
-        AgentRuns(name, made_up.estimate(90.0 - 50 * n), np.arange(3), np.array(some.get(n, [1.0])))
-        for n, name in enumerate(names)
-    ]
+    """Of the second agent one run has no figure."""
+    some = {0: [85.0, 90, 95], 1: [40.0, np.nan]}
+    return {name: np.array(some.get(n, [1.0])) for n, name in enumerate(names)}
 
 
 def whole_study(root, names, label, linear_up_to=None, on_variant=()):
     """A study that has every kind of figure; its agents rank in the order of their names."""
     agents = tuple(made_up.agent(name, 90.0 - 50 * n) for n, name in enumerate(names))
-    lake, coins = made_up.environment(agents, label), made_up.environment(agents, "coins")
+    lake = made_up.environment(agents, label, values=runs_of(names))
+    coins = made_up.environment(agents, "coins")
     labels = (names * 3)[:3]
     swept = {
         labels[0]: Sweep("α", curve([0.01, 0.1, 0.9], [30, 90, 3]), (labels[1], labels[0], "-")),
@@ -86,8 +84,8 @@ def whole_study(root, names, label, linear_up_to=None, on_variant=()):
     overall = OverallAnalysis({}, (), None, THIRD, profiles)
     learnt = curves_of(names, linear_up_to, on_variant)
     places = (
-        EnvironmentSeries(lake, learnt, runs_of(names), None, swept, {"swept": grid}),
-        EnvironmentSeries(coins, None, (), PullSeries(pulls, 75.0, BOUNDS, arms, (belief,)), {}),
+        EnvironmentSeries(lake, learnt, None, swept, {"swept": grid}),
+        EnvironmentSeries(coins, None, PullSeries(pulls, 75.0, BOUNDS, arms, (belief,)), {}),
     )
     found = made_up.analysis([lake, coins], names[::-1], root, overall=overall)
     return StudySeries(found, agent_marks(found.study), places)

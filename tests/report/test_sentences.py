@@ -21,7 +21,7 @@ from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.report.documents import headline, verdicts_as, write_verdicts
 from rl_yardstick.report.page import render, result_sections
 from rl_yardstick.report.page.frame import Report
-from rl_yardstick.report.series import EnvironmentSeries, StudySeries, agent_marks, run_series
+from rl_yardstick.report.series import EnvironmentSeries, StudySeries, agent_marks
 from rl_yardstick.report.terminal import print_analysis
 from rl_yardstick.report.words import answer, conclusion, pairs_both_ways
 from rl_yardstick.verdicts import Best, judge
@@ -260,7 +260,7 @@ def test_the_terminal_agrees(study, width):
 def test_the_page_and_the_data_of_its_figures_agree(study):
     analysis, words, best = study
     (place,) = analysis.environments
-    one = EnvironmentSeries(place, None, run_series(analysis.results, place), None, {})
+    one = EnvironmentSeries(place, None, None, {})
     report = Report(StudySeries(analysis, agent_marks(analysis.study), (one,)), "compare")
     sections = [result_sections.verdict(report), result_sections.comparison(report)]
     page = Page(render(report, sections))

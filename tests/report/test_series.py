@@ -20,7 +20,6 @@ from rl_yardstick.report.series import (
     learning_curves,
     mean_regret,
     regret_of_runs,
-    run_series,
     study_series,
     sweeps,
 )
@@ -73,13 +72,6 @@ def test_mean_curves_the_best_agent_first(lake):
     variant = replace(lake[1], agents=(made_up.agent("b", 90.0, changes=("random starts",)),))
     found = learning_curves(lake[0], variant)
     assert (found["evaluation"].on_variant, found["training"].on_variant) == ((), ("b",))
-
-
-def test_runs_with_a_figure_by_seed(lake):
-    found = [
-        (r.agent, r.seeds.tolist(), r.values.tolist(), r.mean.point) for r in run_series(*lake)
-    ]
-    assert found == [("b", [0], [8], 90), ("a", [0, 2], [4, 6], 40)]
 
 
 def swept(label, value, group="sarsa", name="alpha"):

@@ -20,7 +20,7 @@ from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.report import words
 from rl_yardstick.report.documents import MARKUPS, headline, verdicts_as
 from rl_yardstick.report.page.frame import Report, Section, setting
-from rl_yardstick.report.ranking import COLUMNS, OTHER_RETURNS, Column, Row, filled
+from rl_yardstick.report.ranking import COLUMNS, OTHER_RETURNS, Column, Order, Row, filled
 from rl_yardstick.report.series import LINEAR, SCORES, STRETCHED, Curve, EnvironmentSeries
 from rl_yardstick.report.words import number, seed_sentence, with_best_mean
 
@@ -119,9 +119,10 @@ def ranking(report: Report) -> Section | None:
 def _table(study: StudySpec, columns: Sequence[Column], rows: Sequence[Row]) -> dict[str, Any]:
     """The columns, the words in their headings, and each agent's cells."""
     shown, of = filled(columns, rows), rows[0].environment
+    best_first: Order = "ascending" if study.metric in COSTS else "descending"
     return {
         "columns": [column for column, _ in shown],
-        "orders": [column.order(study) for column, _ in shown],
+        "orders": [column.best_first or best_first for column, _ in shown],
         "words": {"threshold": number(of.threshold), "failed": number(of.failure_threshold)},
         "rows": [(row.agent, [cells[k] for _, cells in shown]) for k, row in enumerate(rows)],
     }

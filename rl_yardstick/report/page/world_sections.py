@@ -22,7 +22,7 @@ from rl_yardstick.experiments.results import read_compared
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.files import read_arrays, read_bytes, read_json
 from rl_yardstick.pipeline.run import MEANINGS
-from rl_yardstick.report.films import films_of, has_film
+from rl_yardstick.report.films import film_of, has_film
 from rl_yardstick.report.page.frame import Report, Section, data_uri, first_runs, layout_data
 from rl_yardstick.report.series import SPREAD, Curve, Pulls, mean_of, mean_regret, regret_of_runs
 from rl_yardstick.report.words import number, whys_of
@@ -239,7 +239,7 @@ def played_episodes(report: Report) -> Section | None:
     """An episode of each agent as an animated picture; None where nothing can be drawn."""
     ranked = first_runs(report.analysis)
     to_film = [run for runs in ranked for run in runs[:MOST_FILMED]]
-    made = films_of(to_film) if all(map(has_film, to_film)) else do_aside(films_of, to_film)
+    made = [film_of(run) if has_film(run) else do_aside(film_of, run) for run in to_film]
     paths = dict(zip((run.path for run in to_film), made, strict=True))
     contents: dict[bytes, int] = {}  # of each film its place on the page; equal films share one
     groups: list[list[dict[str, Any]]] = [[] for _ in ranked]
