@@ -226,10 +226,13 @@ def table_logs(
     table: pd.DataFrame, path: Path, columns: Mapping[str, str], notes: list[str]
 ) -> list[Log]:
     """The runs in a table; UserError if it has no column of returns."""
+    table = table.rename(columns=str)
     if {"tag", "value"} <= {*table.columns}:  # as rlberry exports: a column for each tag
         tags = returns_in(map(str, table["tag"].unique()))
         values = {tag: table["value"].where(table["tag"] == tag) for tag in tags}
         table = table.drop(columns=["tag", "value"]).assign(**values)
+    if charts := _chart_logs(table, path):
+        return charts
     names = _named_columns(table, columns, path)
     scores = [columns["score"]] if "score" in columns else returns_in(table.columns)
     if not scores:
@@ -280,3 +283,14 @@ def _add_columns(log: Log, rows: pd.DataFrame, step: str | None, scores: Sequenc
             log.add(name, np.arange(1, len(values) + 1), values)
         elif np.isfinite(values).any():
             log.figures.setdefault(kind_of(name), float(np.nanmean(values)))
+
+
+def _chart_logs(table: pd.DataFrame, path: Path) -> list[Log]:
+    """The runs of a chart that Weights & Biases exported, with columns ``NAME - METRIC``."""
+    logs: dict[str, Log] = {}
+    for column in table.columns[1:]:
+        name, _, metric = column.rpartition(" - ")
+        if name and returns_in([metric]):
+            values = pd.to_numeric(table[column], errors="coerce")
+            logs.setdefault(name, Log(name, path)).add(metric, table.iloc[:, 0], values)
+    return list(logs.values())

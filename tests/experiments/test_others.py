@@ -168,6 +168,15 @@ def of_rlberry():
     return pd.concat([times, long.assign(tag="eval_rewards")]).assign(dw_time_elapsed=0.5)
 
 
+def of_wandb():
+    names = {key: f"Lake-v7__{key[0]}__{key[1]}__1700000000" for key in FIGURES}
+    found = {"Step": [100, 200, 300]}
+    for key, value in FIGURES.items():
+        for end in ("", "__MIN", "__MAX"):
+            found[f"{names[key]} - charts/ep_rew_mean{end}"] = [1.0, np.nan, value]
+    return pd.DataFrame(found)
+
+
 @pytest.mark.parametrize(
     ("made", "words"),
     [
@@ -177,6 +186,7 @@ def of_rlberry():
         (curves("rollout/ep_rew_mean"), "last 100 training"),
         (episodes_table(), "last 100 training"),
         (of_rlberry(), "last evaluation"),
+        (of_wandb(), "last 100 training"),
     ],
 )
 def test_tables_are_judged_as_their_numbers_are(tmp_path, made, words):
