@@ -249,6 +249,8 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
         else:
             episodes = read_episodes(planned.path)
             steps, returns = read_evaluations(planned.path / "evaluations.npz")
+            if recorded["final"] and recorded["n_timesteps"] in steps[-1:]:
+                returns[-1] = recorded["final"]["mean_return"]  # that one preceded the last update
             evaluations = evaluation_curve(planned, episodes, steps, returns)
             curves = [evaluations, training_curve(planned, episodes)]
             rows = [summary_row(study, planned, recorded, episodes, curves[0])]

@@ -127,6 +127,16 @@ def test_where_an_agent_remembers_all_have_its_scale(tmp_path):
     assert not found.optima
 
 
+def test_a_curve_ends_at_the_final_policy(tmp_path):
+    """The evaluation at the last step comes before the last update."""
+    study = study_of(n_seeds=1, agents=("qlearning",))
+    (run,) = plan(study, tmp_path)
+    write_run(run, [(50, 10.0), (100, 96.0)], final={"mean_return": 90.0})
+    results = read_results(study, [run], tmp_path)
+    assert results.curves.query("kind == 'evaluation'")["value"].tolist() == [10.0, 90.0]
+    assert results.summary["area"].tolist() == [50.0]
+
+
 def test_the_columns_of_the_files_are_documented():
     """What the files hold is recorded in ``tests/golden``."""
     text = (Path(__file__).parents[2] / "docs" / "compare.md").read_text()
