@@ -187,9 +187,8 @@ def judge(
         if isinstance(what, pd.DataFrame):
             paths = [Path(folder) / "table.csv"]
             what.to_csv(paths[0], index=False)
-        own = [f"{name}={column}" for name, column in (columns or {}).items()]
-        words = [*map(str, paths), *(["--columns", *own] if own else [])]
-        args = _flags(compare_command, env, [], settings, words)
+        args = _flags(compare_command, env, [], settings, [*map(str, paths)])
+        args.columns = dict(columns or {})
         console = TextConsole(file=text, width=100, **_PLAIN)
         root = compare_command.judge_logs(args, args.command, console, stop)
     return Study(root, text.getvalue())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import gc
 import io
 import os
@@ -24,18 +23,6 @@ COMMANDS = {
     "inspect": "list the content of a model file without running any of it",
 }
 
-# For terminals that know ASCII alone.
-PLAIN = {"±": "+-", "…": "...", "∞": "inf", "×": "x", "–": "-", "━": "-"}  # noqa: RUF001
-
-
-def _plain(error: UnicodeError) -> tuple[str, int]:
-    assert isinstance(error, UnicodeEncodeError)
-    text = error.object[error.start : error.end]
-    return "".join(PLAIN.get(sign, "?") for sign in text), error.end
-
-
-codecs.register_error("plain", _plain)
-
 
 def main() -> NoReturn:
     """``yardstick COMMAND`` and ``python -m rl_yardstick COMMAND``."""
@@ -55,7 +42,7 @@ def run_command(name: str) -> NoReturn:
     gc.set_threshold(100_000)  # importing the libraries makes many objects that stay
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="plain")
+            stream.reconfigure(errors="replace")  # a terminal may know ASCII alone
     leave, own = os._exit, os.getpid()
     # Until the work is done nothing ends this process with 0, such as os._exit in an environment.
     os._exit = lambda status: leave(status or int(os.getpid() == own))

@@ -138,7 +138,6 @@ _INSTEAD: Mapping[str, str] = {
     **dict.fromkeys(("-yaml", "--yaml-file"), "did you mean '--conf-file'?"),
     "--n-evaluations": "give the steps between evaluations: --eval-freq",
     "--trial-id": "tune writes a file for --conf-file, winner.yml",
-    "--trust": "it is not needed: every file is read as data",
 }
 
 
@@ -205,6 +204,7 @@ def folder_name(text: str) -> str:
 COUNT = whole_number(1)
 BUDGET = whole_number(1, besides={-1: "as in the hyperparameters"})  # as in rl_zoo3
 INTERVAL = whole_number(-LARGEST)  # below 1 for never, as in rl_zoo3
+VERBOSITY = whole_number(0, 2)
 LOG_INTERVAL = whole_number(1, besides={-1: "the library's default", -2: "no log"})
 SEED = whole_number(0, 2**32 - 1, besides={-1: "a random one"})  # NumPy's generator takes 32 bits
 FIRST_SEED = whole_number(0, 2**31)

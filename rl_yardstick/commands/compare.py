@@ -10,15 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
-from rl_yardstick.commands.cli import (
-    Flags,
-    OneLineParser,
-    flag,
-    several,
-    shared,
-    switch,
-    whole_number,
-)
+from rl_yardstick.commands.cli import Flags, OneLineParser, flag, several, shared, switch
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
 
 if TYPE_CHECKING:
@@ -53,7 +45,7 @@ def _margin(text: str) -> float:
     raise argparse.ArgumentTypeError(f"must be a number of at least 0, not {text!r}")
 
 
-SEEDS = whole_number(1, 1_000_000)
+SEEDS = cli.whole_number(1, 1_000_000)
 FLAGS: Flags = {
     "": (
         flag("study", "a study (a file, or a shipped one), or logs of finished runs", nargs="*"),
@@ -84,7 +76,7 @@ FLAGS: Flags = {
         flag("--metric", "the figure that verdicts compare: final, best, area, regret, ..."),
         flag("--margin", "difference of the means within which agents are tied", _margin),
         flag("--episodes-table", "average, min, max of every N episodes", cli.COUNT),
-        flag("--render-every", "film an episode after every N episodes", whole_number(0), 0),
+        flag("--render-every", "film an episode after every N episodes", cli.whole_number(0), 0),
         flag("--name", "name of the study's folder", cli.folder_name, metavar="NAME"),
         flag("-f --log-folder", "folder of all studies", default="logs/studies"),
         switch("-tb --tensorboard", "write a TensorBoard log of each run"),
@@ -119,6 +111,7 @@ def main() -> int:
 
     stop = Stop().listen()
     cli.import_typed(args)
+    args.columns = dict(word.partition("=")[::2] for word in args.columns)
     if args.logged or args.policy:
         return compare_on_log(args)
     from rl_yardstick.commands.terminal import table_console
@@ -171,17 +164,16 @@ def judge_logs(args: argparse.Namespace, command: str, console: Console, stop: S
     from rl_yardstick.experiments.study import file_name
     from rl_yardstick.pipeline.settings import parse_assignments
 
-    columns = dict(word.partition("=")[::2] for word in args.columns)
     kwargs = parse_assignments(args.env_kwargs, "--env-kwargs")
     env, metric = (args.env or [Options.env])[0], args.metric or Options.metric
     figures = tuple(args.figures or Options.figures)
-    options = Options(args.pattern, columns, env, kwargs, metric, args.margin, figures)
+    options = Options(args.pattern, args.columns, env, kwargs, metric, args.margin, figures)
     paths = [Path(word) for word in args.study]
     root = Path(args.log_folder) / (args.name or file_name(paths[0].absolute().stem))
     if (root / "study.json").exists():
         raise UserError(f"{root} is a study's folder: give another one by --name NAME")
     with console.status("reading the logs"):
-        logs, notes = find_logs(paths, columns)
+        logs, notes = find_logs(paths, args.columns)
         results = results_of(logs, notes, options, root)
     for line in (results.study.title, *notes):
         console.print(line)
@@ -232,16 +224,38 @@ def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> W
         raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'") from None
 
 
-def finished(job: Job, record: StudyRecord) -> tuple[StudyResults, Study | None]:
-    """Do the missing runs of a study; return the results of all, and the verdicts of a look."""
+def finished(
+    job: Job, record: StudyRecord, is_enough: Callable[[Study], bool] = lambda said: False
+) -> tuple[StudyResults, Study | None]:
+    """Do the missing runs of a study; return the results of all, and the verdicts of the last look.
+
+    A growing study does one planned look after another, until no agent needs seeds or
+    ``is_enough``; it begins with the first look, because finished runs may already be enough.
+    """
     from rl_yardstick.experiments.plan import plan
 
-    planned = plan(record.study, job.root, specs=record.specs)
+    planned, known = plan(record.study, job.root, specs=record.specs), dict[Any, Any]()
     check_settings_kept(job.root, planned)
     record.write(job.root)
-    if record.looks:
-        return look_by_look(job, record)
-    return do_study(job, record.study, planned), None
+    if not record.looks:
+        return do_study(job, record.study, planned, known), None
+    from rl_yardstick.experiments.analysis import looked
+
+    counts, n_said = dict.fromkeys(record.specs, record.study.n_seeds), 0
+    while True:
+        study = replace(record.study, n_seeds=max(counts.values()))
+        planned = plan(study, job.root, counts, record.specs)
+        results = do_study(job, study, planned, known)
+        said = looked(results, record.looks)
+        if said.n_looks != n_said:
+            n_said = said.n_looks
+            n = sum(pair.word == "undecided" for pair in said.pairs)
+            told = f"{n} of {len(said.pairs)} pairs undecided" if n else "all pairs are decided"
+            where = f"look {n_said} of {len(record.looks)}, at {record.looks[n_said - 1]:,} seeds"
+            job.console.print(f"{where}: {told}")
+        if said.is_done or is_enough(said):
+            return results, said
+        counts |= {(agent, e): n for e, by in said.seeds.items() for agent, n in by.items()}
 
 
 def carry_out(job: Job, record: StudyRecord) -> int:
@@ -268,19 +282,17 @@ def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
         named = [f"{key}: {shown(a)} there, {shown(b)} now" for key, (a, b) in pairs.items()]
         words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
         runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
-        raise UserError(
-            f"{root}: {runs} other settings ({words}): give the study another folder by --name NAME"
-        )
+        fault = f"{root}: {runs} other settings ({words})"
+        raise UserError(f"{fault}: give the study another folder, by --name or -f")
 
 
 def do_study(
-    job: Job, study: StudySpec, planned: Sequence[PlannedRun], known: dict[Any, Any] | None = None
+    job: Job, study: StudySpec, planned: Sequence[PlannedRun], known: dict[Any, Any]
 ) -> StudyResults:
     """Do the missing runs of a study, and read all; ``known`` were read or failed before."""
     from rl_yardstick.agents.registry import ALGORITHMS
     from rl_yardstick.experiments.pool import do_runs
 
-    known = {} if known is None else known
     failures: dict[Path, str] = known.setdefault("failures", {})
     to_do = [run for run in planned if run.path not in failures and not run.is_finished]
     n_done = len(planned) - len(to_do)
@@ -304,35 +316,6 @@ def do_study(
     with job.console.status("reading the results"):
         results = read_results(study, planned, job.root, known.setdefault("results", {}))
     return replace(results, failures=failures)
-
-
-def look_by_look(
-    job: Job, record: StudyRecord, is_enough: Callable[[Study], bool] = lambda said: False
-) -> tuple[StudyResults, Study]:
-    """Do the runs of one planned look after another, until no agent needs seeds or ``is_enough``.
-
-    It begins with the first look: finished runs may already be enough.
-    """
-    from rl_yardstick.experiments.analysis import looked
-    from rl_yardstick.experiments.plan import plan
-
-    counts = dict.fromkeys(record.specs, record.study.n_seeds)
-    n_said, known = 0, dict[Any, Any]()
-    while True:
-        study = replace(record.study, n_seeds=max(counts.values()))
-        planned = plan(study, job.root, counts, record.specs)
-        results = do_study(job, study, planned, known)
-        said = looked(results, record.looks)
-        is_over = said.is_done or is_enough(said)
-        if said.n_looks != n_said:
-            n_said = said.n_looks
-            n = sum(pair.word == "undecided" for pair in said.pairs)
-            told = f"{n} of {len(said.pairs)} pairs undecided" if n else "all pairs are decided"
-            where = f"look {n_said} of {len(record.looks)}, at {record.looks[n_said - 1]:,} seeds"
-            job.console.print(f"{where}: {told}")
-        if is_over:
-            return results, said
-        counts |= {(agent, e): n for e, by in said.seeds.items() for agent, n in by.items()}
 
 
 def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
@@ -428,12 +411,7 @@ _BESIDE_RESUME = {"resume", "gym_packages", "jobs", "cluster", "no_report", "log
 
 def study_spec(args: argparse.Namespace) -> StudySpec:
     """The study that the arguments select, with their changes."""
-    from rl_yardstick.experiments.study import (
-        StudySpec,
-        find_study,
-        read_study,
-        with_maps_named,
-    )
+    from rl_yardstick.experiments.study import StudySpec, find_study, read_study, with_maps_named
 
     if args.max_seeds is not None and not args.until_decided:
         raise UserError("--max-seeds belongs to --until-decided: give both, or --seeds")
@@ -442,41 +420,40 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
     if args.learning_pages and args.no_report:
         raise UserError("--watch-learning is a section of the page: leave out --no-report")
     cli.check_tensorboard(args.tensorboard)
-    if not args.study:
-        study = _study_of_flags(args)
-    elif args.env or args.algos:
+    if args.study and (args.env or args.algos):
         raise UserError("give a study file, or --env and --algos, not both")
-    else:
-        study = read_study(find_study(args.study[0]))
+    if not args.study and not (args.env and args.algos):
+        raise UserError("what to compare? give --env and --algos, or a study file")
+    is_file = bool(args.study)
+    study = read_study(find_study(args.study[0])) if is_file else study_of(args.algos, args.env)
     # A flag with the name of a field sets that field, if it is given.
     named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
     changes = {**named, "n_seeds": args.seeds, "gym_packages": tuple(args.gym_packages)}
     changes["figures"] = None if args.figures is None else tuple(args.figures)
     changes = {key: value for key, value in changes.items() if value is not None}
     study = with_maps_named(replace(_with_settings(study, args), **changes))
-    if not args.study:
+    if not is_file:
         environments = ", ".join(each.label for each in study.environments)
         study = replace(study, title=f"{', '.join(args.algos)} on {environments}")
     return study.quickened() if args.is_quick else study
 
 
-def _study_of_flags(args: argparse.Namespace) -> StudySpec:
+def study_of(algos: Sequence[str], env_ids: Sequence[str]) -> StudySpec:
+    """A study without a title of agents and environments, whose names are checked."""
     from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name
     from rl_yardstick.pipeline.environments import check_env_id
     from rl_yardstick.pipeline.settings import check_agent
 
-    if not (args.env and args.algos):
-        raise UserError("what to compare? give --env and --algos, or a study file")
-    for check, names in ((check_agent, args.algos), (check_env_id, args.env)):
+    for check, names in ((check_agent, algos), (check_env_id, env_ids)):
         for name in names:
             check(name)
         if len(set(names)) < len(names):
             raise UserError("--env or --algos names one of them twice")
     return StudySpec(
-        name=file_name(f"{'-'.join(args.env).replace('/', '-')}_{'-'.join(args.algos)}"),
+        name=file_name(f"{'-'.join(env_ids).replace('/', '-')}_{'-'.join(algos)}"),
         title="",
-        agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
-        environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),
+        agents=tuple(AgentSpec(algo, algo) for algo in algos),
+        environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in env_ids),
     )
 
 
@@ -545,15 +522,14 @@ def compare_on_log(args: argparse.Namespace) -> int:
         raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
     if args.study or args.env or args.algos:
         raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
-    columns = dict(word.partition("=")[::2] for word in args.columns)
-    if wrong := columns.keys() - {"arm", "reward", "propensity"}:
+    if wrong := args.columns.keys() - {"arm", "reward", "propensity"}:
         raise UserError(f"--columns {wrong.pop()}: name arm, reward or propensity, as arm=item_id")
     console = table_console()
     from rl_yardstick.experiments.off_policy import compare_policies, load_policy, read_logged
     from rl_yardstick.report.terminal import print_comparison
 
     with console.status("judging the policies"):
-        data = read_logged(args.logged, columns)
+        data = read_logged(args.logged, args.columns)
         policies = [load_policy(path, args.gym_packages) for path in dict.fromkeys(args.policy)]
         compared = compare_policies(data, policies)
     print_comparison(console, compared)

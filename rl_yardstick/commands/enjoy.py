@@ -56,7 +56,7 @@ FLAGS: Flags = {
         flag("--no-render", "--render none", action="store_const", const="none", dest="render"),
         flag("--record", "write a film (.gif)", metavar="FILE"),
         flag("--reward-log", "write the returns there, as Monitor's CSV files", metavar="DIR"),
-        flag("--verbose", "0 for no output (default: 1)", whole_number(0, 2), 1),
+        flag("--verbose", "0 for no output (default: 1)", cli.VERBOSITY, 1),
         switch("--norm-reward", "returns of normalised rewards, as in training"),
         switch("-P --progress", argparse.SUPPRESS),  # of rl_zoo3, and not needed
         switch("--custom-objects", argparse.SUPPRESS),

@@ -135,9 +135,9 @@ def tried_changes(
     console: Any, args: argparse.Namespace, one: Asked, explained: Explanation
 ) -> list[Any]:
     """Train four seeds as shipped, as it is and with each change; return the returns as JSON."""
-    from rl_yardstick.commands.compare import Job, do_study, held
+    from rl_yardstick.commands.compare import Job, finished, held
     from rl_yardstick.commands.terminal import say
-    from rl_yardstick.experiments.plan import StudyRecord, plan, specs_of
+    from rl_yardstick.experiments.plan import StudyRecord, specs_of
     from rl_yardstick.experiments.pool import Workers
     from rl_yardstick.experiments.results import tried
     from rl_yardstick.experiments.study import intervention_study
@@ -148,13 +148,10 @@ def tried_changes(
     changes = [" ".join(change) for change in args.test if change] or explained.proposals
     name = one.found.path.stem if run is None else f"{spec.algo}_{run.name}"
     study = intervention_study(spec, changes, name)
-    root, specs = Path(args.folder) / "explain" / study.name, specs_of(study)
-    planned = plan(study, root, specs=specs)
-    workers = Workers(args.jobs)
-    with held(root), workers:
-        StudyRecord(study, specs).write(root)
-        job = Job(root, cli.command_line(), console, Stop().listen(), workers)
-        found = tried(do_study(job, study, planned))
+    root, record = Path(args.folder) / "explain" / study.name, StudyRecord(study, specs_of(study))
+    job = Job(root, cli.command_line(), console, Stop().listen(), Workers(args.jobs))
+    with held(root), job.workers:
+        found = tried(finished(job, record)[0])
     for line in tried_lines(found, explained.optimum):
         say(console, line)
     return [{"change": each.change, "returns": each.finished.tolist()} for each in found]

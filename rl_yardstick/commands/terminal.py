@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console, ConsoleOptions, RenderableType
-from rich.segment import Segment
+from rich.console import Console
 from rich.text import Text
 
 from rl_yardstick.pipeline.errors import visible
@@ -48,14 +47,6 @@ class TextConsole(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         """As Rich does, with control characters made visible, so that the width is right."""
         return super().render_str(visible(text), **options)
-
-    def render(
-        self, renderable: RenderableType, options: ConsoleOptions | None = None
-    ) -> Iterable[Segment]:
-        """As Rich does, with control characters made visible in every segment."""
-        for segment in super().render(renderable, options):
-            text, style, control = segment
-            yield segment if control else Segment(visible(text), style)
 
 
 def table_console() -> Console:

@@ -10,15 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
-from rl_yardstick.commands.cli import (
-    Flags,
-    OneLineParser,
-    flag,
-    several,
-    shared,
-    switch,
-    whole_number,
-)
+from rl_yardstick.commands.cli import Flags, OneLineParser, flag, several, shared, switch
 from rl_yardstick.pipeline.errors import Stopped, UserError
 
 if TYPE_CHECKING:
@@ -34,7 +26,7 @@ PAGE = "learning.html"
 TRACKED = "runs"  # where TensorBoard's files of --track go, as in rl_zoo3
 STORAGE = "hyperparameters of an Optuna trial in sqlite:///FILE or a journal FILE.log"
 WATCH = f"write a page that plays the training ({PAGE} in the run folder)"
-WATCHED = whole_number(1, besides={0: "the steps in which its policy improves"})
+WATCHED = cli.whole_number(1, besides={0: "the steps in which its policy improves"})
 # Flags that may stand beside --resume: none of the training itself.
 _BESIDE_RESUME = {"resume", "log_folder", "gym_packages", "verbose", "progress", "track"}
 _BESIDE_RESUME |= {"wandb_project_name", "wandb_entity", "wandb_group", "wandb_tags"}
@@ -60,7 +52,7 @@ FLAGS: Flags = {
         *shared("--hyperparams", "--engine", "--conf-file", "--env-kwargs"),
         flag("--storage", STORAGE, metavar="WHERE"),
         flag("--study-name", "name of that study", metavar="NAME"),
-        flag("--trial-id", "number of that trial (default: the best)", whole_number(0)),
+        flag("--trial-id", "number of that trial (default: the best)", cli.whole_number(0)),
         several("--eval-env-kwargs", "environment arguments for evaluation only"),
         *shared("--gym-packages"),
         flag("-i --trained-agent", "zip or run folder to train further", default="", metavar="ZIP"),
@@ -83,7 +75,7 @@ FLAGS: Flags = {
         flag("--wandb-group", "its group of runs", metavar="NAME"),
         several("-tags --wandb-tags", "its tags", metavar="TAG"),
         flag("--log-interval", "episodes or rollouts between log records", cli.LOG_INTERVAL, -1),
-        flag("--verbose", "0 silent, 1 (default), 2 the library's tables", whole_number(0, 2), 1),
+        flag("--verbose", "0 silent, 1 (default), 2 the library's tables", cli.VERBOSITY, 1),
         switch("-P --progress", "a progress bar even without a terminal"),
         *shared("--diagnose"),
         flag("--watch-learning", WATCH, nargs="?", const="", metavar="FILE"),
@@ -172,26 +164,20 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
     """The spec that the flags and the hyperparameters ask for; torch is not imported."""
     from secrets import randbelow
 
-    from rl_yardstick.pipeline.environments import (
-        check_env_id,
-        check_fit,
-        map_name,
-        with_files_read,
-    )
-    from rl_yardstick.pipeline.settings import check_agent, read_spec
+    from rl_yardstick.pipeline import environments, settings
 
-    check_agent(args.algo)
-    check_env_id(args.env)
+    settings.check_agent(args.algo)
+    environments.check_env_id(args.env)
     cli.check_tensorboard(args.tensorboard_log)
     cli.check_wandb(args.track)
     cli.check_device(args.device)
     entry, origins = entry_from_flags(args)
     names = ["eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer"]
     names += ["log_interval", "vec_env", "device", "diagnose", "watch_episodes", "gym_packages"]
-    spec = read_spec(
+    spec = settings.read_spec(
         args.algo,
         args.env,
-        with_files_read(args.env, entry),
+        environments.with_files_read(args.env, entry),
         seed=args.seed if args.seed >= 0 else randbelow(2**31),
         final_episodes=args.eval_episodes,
         n_threads=args.num_threads,
@@ -200,46 +186,41 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
         tensorboard_log=args.tensorboard_log or (TRACKED if args.track else None),
         library_log=args.verbose > 1,
         watch_learning=_page(args),
-        map_name=map_name(args.env, entry),
+        map_name=environments.map_name(args.env, entry),
         origins=origins,
         **{name: getattr(args, name) for name in names},
     )
-    check_fit(spec)
+    environments.check_fit(spec)
     return spec
 
 
 def entry_from_flags(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
     """The entry with the changes of the command line, and notes on dropped settings."""
-    from rl_yardstick.pipeline.settings import (
-        override,
-        parse_assignments,
-        read_entry,
-        training_follows,
-    )
+    from rl_yardstick.pipeline import settings
 
-    typed = parse_assignments(args.hyperparams, "-params")
+    typed = settings.parse_assignments(args.hyperparams, "-params")
     changes = cli.with_engine(args.algo, typed, args.engine)
     for key in ("env_kwargs", "eval_env_kwargs"):
         if given := getattr(args, key):
-            named = parse_assignments(given, f"--{key.replace('_', '-')}")
+            named = settings.parse_assignments(given, f"--{key.replace('_', '-')}")
             changes[key] = {**(changes.get(key) or {}), **named}
     for key in ("n_timesteps", "n_episodes"):
         if (budget := getattr(args, key)) > 0:
             changes[key] = budget
     trial = trial_from_flags(args) if "storage" in args else {}  # shaping has no such flag
     try:
-        entry = read_entry(args.algo, args.env, args.conf_file, changes.get("env_kwargs"))
+        entry = settings.read_entry(args.algo, args.env, args.conf_file, changes.get("env_kwargs"))
     except UserError:
         if not (changes or trial) or args.conf_file:
             raise
         entry = {}
-    entry = override(entry, trial)
+    entry = settings.override(entry, trial)
     merged = {
         key: {**(entry.get(key) or {}), **changes[key]}
         for key in ("env_kwargs", "eval_env_kwargs")
         if changes.get(key)
     }
-    return training_follows(override(entry, {**changes, **merged}), changes)
+    return settings.training_follows(settings.override(entry, {**changes, **merged}), changes)
 
 
 def trial_from_flags(args: argparse.Namespace) -> dict[str, Any]:

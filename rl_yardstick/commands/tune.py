@@ -14,15 +14,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from rl_yardstick.commands import cli, compare
-from rl_yardstick.commands.cli import (
-    Flags,
-    OneLineParser,
-    flag,
-    seconds,
-    shared,
-    switch,
-    whole_number,
-)
+from rl_yardstick.commands.cli import Flags, OneLineParser, flag, seconds, shared, switch
 from rl_yardstick.commands.compare import Job, held
 from rl_yardstick.commands.terminal import say, table_console
 from rl_yardstick.pipeline.errors import Stopped, UserError
@@ -52,7 +44,7 @@ examples:
 The same command again continues the search.
 """
 
-SEEDS, TRIALS, STARTUP = (whole_number(*ends) for ends in ((1, 1000), (1, 10**5), (0, 10**5)))
+SEEDS, TRIALS, STARTUP = (cli.whole_number(*ends) for ends in ((1, 1000), (1, 10**5), (0, 10**5)))
 FOLDER = "-f --log-folder --optimization-log-path"  # as in rl_zoo3
 FLAGS: Flags = {
     "": (
@@ -70,11 +62,11 @@ FLAGS: Flags = {
         flag("--pruner", "whether hopeless trials end early", default="auto", choices=PRUNERS),
         flag("--n-startup-trials", "random trials before the sampler learns (10)", STARTUP, 10),
         flag("--search-space", "the values to choose from", Path, metavar="YAML"),
-        flag("--seed", "seed of the search (0)", whole_number(0, 2**32 - 1), 0),
+        flag("--seed", "seed of the search (0)", cli.whole_number(0, 2**32 - 1), 0),
         flag("--timeout", "begin no more runs after this time", seconds, math.inf, metavar="TIME"),
     ),
     "re-test": (
-        flag("--retest", "settings to run again on other seeds (3)", whole_number(0, 100), 3),
+        flag("--retest", "settings to run again on other seeds (3)", cli.whole_number(0, 100), 3),
         flag("--retest-seeds", "how many other seeds (20)", SEEDS, 20),
         flag("--first-retest-seed", "the first of these (1000)", cli.FIRST_SEED, 1000),
         switch("--until-decided", "add seeds, at looks fixed before, until the best is decided"),
@@ -108,27 +100,17 @@ def build_parser() -> OneLineParser:
 
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     """The search that the arguments ask for."""
-    from rl_yardstick.experiments.study import (
-        AgentSpec,
-        EnvironmentSpec,
-        StudySpec,
-        file_name,
-        with_maps_named,
-    )
-    from rl_yardstick.pipeline.environments import check_env_id
-    from rl_yardstick.pipeline.settings import check_agent
+    from rl_yardstick.experiments.study import AgentSpec, with_maps_named
 
     if importlib.util.find_spec("optuna") is None:
         raise UserError("tuning needs: pip install 'rl-yardstick[tune]'")
-    check_agent(args.algo)
-    check_env_id(args.env)
+    study = compare.study_of([args.algo], [args.env])
     # The settings that the command line fixes.
     settings = cli.with_engine(args.algo, compare.typed_settings(args), args.engine)
-    study = StudySpec(
-        name=args.name or file_name(f"{args.env.replace('/', '-')}_{args.algo}"),
-        title="",
+    study = replace(
+        study,
+        name=args.name or study.name,
         agents=(AgentSpec(SHIPPED, args.algo, settings, conf_file=args.conf_file),),
-        environments=(EnvironmentSpec(args.env, args.env),),
         n_seeds=args.seeds_per_trial,
         first_seed=args.first_seed,
         eval_freq=args.eval_freq,
@@ -190,7 +172,7 @@ def do_trials(job: Job, search: Search) -> None:
     whole = [t.value for t in ended if t.state.name == "COMPLETE" and t.value is not None]
     best = min((sign * value for value in whole), default=math.inf)
     n_failed = 0
-    with progress(job.console, search.n_trials - len(ended), "trials") as advance:
+    with progress(job.console, search.tuning.n_trials - len(ended), "trials") as advance:
 
         def tell(number: int, value: float | None, failure: str) -> None:
             nonlocal best, n_failed
@@ -231,7 +213,7 @@ def retested(
 ) -> tuple[int, Outcome]:
     """Do the re-test; return the exit code and the outcome."""
     from rl_yardstick.experiments.analysis import analyse
-    from rl_yardstick.experiments.plan import StudyRecord, plan, plan_of_looks, specs_of
+    from rl_yardstick.experiments.plan import StudyRecord, plan_of_looks, specs_of
     from rl_yardstick.tuning.retesting import FOLDER, concluded, is_settled, retest_study
 
     tuning, again = search.tuning, replace(job, root=job.root / FOLDER)
@@ -239,11 +221,7 @@ def retested(
     looks = plan_of_looks(study, again.root, most) if tuning.until_decided else ()
     record = StudyRecord(study, specs_of(study), looks)
     with held(again.root):
-        record.write(again.root)
-        if looks:
-            results, _ = compare.look_by_look(again, record, is_settled)
-        else:
-            results = compare.do_study(again, study, plan(study, again.root, specs=record.specs))
+        results, _ = compare.finished(again, record, is_settled)
         code = compare.conclude(again, results, looks)
         with job.console.status("judging the winner"):
             return code, concluded(tuning, ranked, chosen, analyse(results, looks))
@@ -273,12 +251,12 @@ def print_opened(job: Job, search: Search) -> None:
     """Print the number of trials, seeds and free settings."""
     from rl_yardstick.tuning.retesting import unproven_mark
 
-    suggestions = search.suggestions
+    suggestions, tuning = search.suggestions, search.tuning
     n_there = sum(trial.state.is_finished() for trial in search.trials)
-    words = f"{search.n_trials} trials of up to {len(search.tuning.seeds)} seeds, {n_there} of "
+    words = f"{tuning.n_trials} trials of up to {len(tuning.seeds)} seeds, {n_there} of "
     words += f"them there already; {suggestions.n_free} settings to choose; {job.workers.words}"
     say(job.console, f"{words}, in {job.root}")
-    if mark := unproven_mark(search.tuning):
+    if mark := unproven_mark(tuning):
         say(job.console, f"scores are{mark}")
 
 
@@ -286,7 +264,7 @@ def print_search(console: Console, search: Search) -> None:
     """Print the cost of the search, and whether several settings reach the optimum."""
     from rl_yardstick.tuning.searching import FAILURE, outcomes_of
 
-    trials, n_runs = search.trials, search.n_trials * len(search.tuning.seeds)
+    trials, n_runs = search.trials, search.tuning.n_trials * len(search.tuning.seeds)
     states = Counter(
         "failed" if FAILURE in trial.user_attrs else trial.state.name.lower() for trial in trials
     )

@@ -127,8 +127,7 @@ class World:
 
     def map_of(self, actions: Ints, is_blank: Bools) -> str:
         """The map with the action of each state; "?" where ``is_blank``; empty without a map."""
-        layout = None if self.exact is None else self.exact.layout
-        if layout is None or self.exact is None:
+        if self.exact is None or (layout := self.exact.layout) is None:
             return ""
         cells = list("".join(layout.rows))
         for cell, letter in enumerate(cells):

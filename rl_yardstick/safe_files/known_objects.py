@@ -7,7 +7,7 @@ import importlib
 import io
 import math
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache, partial
 from typing import Any
 
@@ -197,7 +197,7 @@ _FILLED = (
     *(spaces.Dict, spaces.Tuple, RunningMeanStd),
 )
 _NOISES = (noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise)
-_CALLED = (TrainFreq, TrainFrequencyUnit, GoalSelectionStrategy)
+_CALLED = by_name([TrainFreq, TrainFrequencyUnit, GoalSelectionStrategy])
 
 
 def _noise(cls: Any, made: Made, build: Build) -> Any:
@@ -206,16 +206,12 @@ def _noise(cls: Any, made: Made, build: Build) -> Any:
     return new
 
 
-def _called(make: Callable[..., Any], made: Made, build: Build) -> Any:
-    return make(*build(made.args))
-
-
 _MAKERS: Mapping[str, Maker] = {
     **_OF_TENSORS,
     **_OF_NUMPY,
     **{name: partial(filled, cls) for name, cls in by_name(_FILLED).items()},
     **{name: partial(_noise, cls) for name, cls in by_name(_NOISES).items()},
-    **{name: partial(_called, cls) for name, cls in by_name(_CALLED).items()},
+    **{name: lambda made, build: _CALLED[made.name](*build(made.args)) for name in _CALLED},
     # The arguments are its contents, always empty, and its maximum length.
     "collections.deque": lambda made, build: deque(build(made.items), *build(made.args[1:2])),
     "rl_zoo3.utils.SimpleLinearSchedule": lambda made, build: AffineTransform(

@@ -24,15 +24,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from torch.overrides import TorchFunctionMode
 
-from rl_yardstick.safe_files import files
+from rl_yardstick.safe_files import files, known_objects
 from rl_yardstick.safe_files.files import SETTINGS, TENSORS, Budget, Source, UnsafeFileError, shown
-from rl_yardstick.safe_files.known_objects import (
-    by_name,
-    check_values,
-    load_tensors,
-    read_pickle,
-    tensors_in,
-)
 from rl_yardstick.safe_files.old_versions import update
 from rl_yardstick.safe_files.pickles import Reader
 
@@ -81,17 +74,17 @@ def load_model(
     for key in settings:
         if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
             raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
-    known = {**by_name(algorithm.policy_aliases.values()), **(classes or {})}
+    known = {**known_objects.by_name(algorithm.policy_aliases.values()), **(classes or {})}
     objects = {name: held for name, held in (custom_objects or {}).items() if name in settings}
     pickled = {name: held for name, held in settings.items() if isinstance(held, bytes)}
     for key in pickled.keys() - objects - replaced.keys():
         try:
-            objects[key] = read_pickle(pickled[key], known, budget=budget)
+            objects[key] = known_objects.read_pickle(pickled[key], known, budget=budget)
         except UnsafeFileError as error:
             raise UnsafeFileError(f"{key} {error}", key) from error
     names = [name for name in members if name.endswith(TENSORS)]
-    tensors = {name: load_tensors(members.pop(name), budget) for name in names}
-    check_values(tensors)
+    tensors = {name: known_objects.load_tensors(members.pop(name), budget) for name in names}
+    known_objects.check_values(tensors)
     try:
         changes = update(tensors, {**settings, **objects, **replaced})
         objects |= {key: value for key, value in changes.items() if key not in replaced}
@@ -210,9 +203,9 @@ def inspect_model(path: Path | str) -> dict[str, dict[str, str]]:
         found["members"][name] = f"{len(held):,} bytes"
         try:
             stem = member.removesuffix(TENSORS)
-            tensors = {stem: load_tensors(held, budget)} if stem != member else {}
-            check_values(tensors)
-            for where, tensor in tensors_in(tensors):
+            tensors = {stem: known_objects.load_tensors(held, budget)} if stem != member else {}
+            known_objects.check_values(tensors)
+            for where, tensor in known_objects.tensors_in(tensors):
                 found["weights"][shown(where)[1:-1]] = str(tuple(tensor.shape))
         except UnsafeFileError as error:
             found["suspicious"][name] = str(error)
@@ -230,5 +223,5 @@ def _setting(key: str, value: Any, budget: Budget) -> str:
     reader.load()
     names = [shown(name)[1:-1] for name in sorted(reader.names)]
     if key != "policy_class" or not names[0].startswith(("stable_baselines3.", "sb3_contrib.")):
-        read_pickle(pickled, budget=budget)
+        known_objects.read_pickle(pickled, budget=budget)
     return "a pickle of " + (", ".join(names) or "plain data")

@@ -11,6 +11,7 @@ import pickle
 import pickletools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar
 
 from rl_yardstick.safe_files.files import Budget, UnsafeFileError, shown
@@ -114,11 +115,8 @@ class Reader(pickle._Unpickler):
         self.persistent_ids.append(pid)
         return Made(PERSISTENT_ID, (pid,))
 
-    def load_dictionary(self) -> None:
-        self.append(Made(DICTIONARY, ()))  # hashing the keys could take for ever
-
-    def load_set(self) -> None:
-        self.append(Made("set", ()))  # no file needs one, but `VecNormalize` may have one inside
+    def load_empty(self, name: str) -> None:
+        self.append(Made(name, ()))
 
     def load_filled_dictionary(self) -> None:
         items = self.pop_mark()
@@ -140,8 +138,10 @@ class Reader(pickle._Unpickler):
             raise UnsafeFileError("a pickle that sets the state of an object that is not new")
         top.state = state
 
-    dispatch[pickle.EMPTY_DICT[0]] = load_dictionary
-    dispatch[pickle.EMPTY_SET[0]] = load_set
+    # Hashing the keys of a dictionary could take for ever. No file needs a set, but `VecNormalize`
+    # may have one inside.
+    dispatch[pickle.EMPTY_DICT[0]] = partial(load_empty, name=DICTIONARY)
+    dispatch[pickle.EMPTY_SET[0]] = partial(load_empty, name="set")
     dispatch[pickle.DICT[0]] = load_filled_dictionary
     dispatch[pickle.REDUCE[0]] = dispatch[pickle.NEWOBJ[0]] = load_call
     dispatch[pickle.BUILD[0]] = load_state

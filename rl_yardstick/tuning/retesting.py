@@ -27,14 +27,7 @@ from rl_yardstick.experiments.study import METRICS, AgentSpec, Metric, StudySpec
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import plain, write_json, write_text
 from rl_yardstick.pipeline.settings import TUNED_ON, seeds_tuned_on
-from rl_yardstick.tuning.searching import (
-    ASKED,
-    FAILURE,
-    SETTINGS,
-    Search,
-    outcome_of,
-    outcomes_of,
-)
+from rl_yardstick.tuning.searching import ASKED, FAILURE, SETTINGS, Search, outcome_of, outcomes_of
 from rl_yardstick.tuning.tuning_spec import SHIPPED, STEPS, Floats, TuningSpec
 from rl_yardstick.verdicts import Estimate, Pair, Study, judge, mean_over_runs
 
@@ -177,10 +170,14 @@ def concluded(
     """The result of the re-test of the ``chosen`` trials; ``ranked`` are all complete ones."""
     # As in the verdicts of a study, a score below 0 counts as 0.
     is_score = tuning.figure == "score" and all(each.is_score for each in analysis.environments)
-    least = 0.0 if is_score and tuning.is_judged_by_study else -math.inf
+    least = 0.0 if is_score and tuning.objective == "mean" else -math.inf
     in_search = {t.number: tuning.value(np.maximum(figures_of(t), least)) for t in ranked}
     numbers = {SHIPPED: 0} | {label_of(trial): trial.number for trial in chosen}
-    figures = {label: np.maximum(_figures(tuning, label, analysis), least) for label in numbers}
+    found: dict[str, list[float]] = {label: [] for label in numbers}
+    for run in analysis.results.planned:
+        with suppress(UserError):  # the study reports missing runs and their reasons
+            found[run.agent].append(outcome_of(tuning, run).figure)
+    figures = {label: np.maximum(values, least) for label, values in found.items()}
     said = analysis.verdicts
     if tuning.figure == STEPS:  # which the study does not compare
         scores = {SHIPPED: {label: -values for label, values in figures.items()}}
@@ -209,15 +206,6 @@ def concluded(
     n_seeds = max(each.n_runs + each.n_missing for each in retested)
     held_out = range(tuning.first_retest_seed, tuning.first_retest_seed + n_seeds)
     return Outcome(tuple(retested), *_winner(tuning, retested), optimism, held_out)
-
-
-def _figures(tuning: TuningSpec, label: str, analysis: StudyAnalysis) -> Floats:
-    figures = []
-    for run in analysis.results.planned:
-        with suppress(UserError):  # the study reports missing runs and their reasons
-            if run.agent == label:
-                figures.append(outcome_of(tuning, run).figure)
-    return np.array(figures)
 
 
 def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested | None, str]:
@@ -273,7 +261,7 @@ def write_winner(search: Search, outcome: Outcome) -> Path | None:
     chosen = f", the best of {n_others} that were run again" if n_others > 1 else ""
     comment = (
         f"Tuned by tune.py on {time.strftime('%Y-%m-%d')}: trial {winner.number} of "
-        f"{search.n_trials} ({tuning.sampler}), {tuning.objective} of {tuning.figure}"
+        f"{tuning.n_trials} ({tuning.sampler}), {tuning.objective} of {tuning.figure}"
         f"{unproven_mark(tuning)} over the seeds {seeds.start} to {seeds.stop - 1}: "
         f"{winner.in_search:.4g}. On the seeds {held_out.start} to {held_out.stop - 1}, which the "
         f"search has not seen{chosen}: {winner.held_out:.4g} ({winner.n_runs} runs); the settings "
@@ -308,7 +296,7 @@ def write_record(search: Search, outcome: Outcome | None, command: str) -> dict[
         **({"figure_mark": mark} if (mark := unproven_mark(tuning)) else {}),
         "objective": tuning.objective,
         "lower_is_better": tuning.is_cost,
-        "n_trials": search.n_trials,
+        "n_trials": tuning.n_trials,
         "n_at_optimum": search.n_at_optimum,
         "seeds": list(tuning.seeds),
         "held_out_seeds": list(held_out),

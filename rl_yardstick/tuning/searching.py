@@ -172,7 +172,7 @@ def worse_by_ranks(scores: Scores, best: Scores) -> bool:
 # --- the trials -----------------------------------------------------------------------------------
 
 
-@dataclass
+@dataclass(eq=False)
 class _UnderWay:
     """A trial that has begun."""
 
@@ -183,40 +183,32 @@ class _UnderWay:
     is_over: bool = False  # whether further results are ignored
 
 
+@dataclass(eq=False)
 class Search:
-    """A search with open storage: hands out runs one by one, and ends trials by their results.
+    """A search with open storage: hands out runs one by one, and ends trials by their results."""
 
-    Attributes:
-        tuning: its specification.
-        root: its folder.
-        study: Optuna's study.
-        suggestions: the settings of its trials.
-        tell: called with the number of each trial that ends, its value (None if it was pruned or
-            failed), and the reason of a failure.
-        deadline: no run begins after this time (`time.monotonic`).
-    """
-
-    def __init__(
-        self, tuning: TuningSpec, root: Path, study: Study, suggestions: Suggestions
-    ) -> None:
-        self.tuning, self.root, self.study, self.suggestions = tuning, root, study, suggestions
-        self.n_trials = tuning.n_trials
-        self.tell: Callable[[int, float | None, str], None] = lambda *_: None
-        self.deadline = math.inf
-        self._trials: list[_UnderWay] = []
-        # Trials that wait for a run, by its folder: trials with equal settings share it.
-        self._waiting: dict[Path, list[_UnderWay]] = {}
-        self._failures: list[str] | None = []  # since the start; None after a success
+    tuning: TuningSpec
+    root: Path  #: its folder
+    study: Study  #: Optuna's study
+    suggestions: Suggestions  #: the settings of its trials
+    #: called with the number of each trial that ends, its value (None if it was pruned or failed),
+    #: and the reason of a failure
+    tell: Callable[[int, float | None, str], None] = lambda *_: None
+    deadline: float = math.inf  #: no run begins after this time (`time.monotonic`)
+    _trials: list[_UnderWay] = field(default_factory=list)
+    # Trials that wait for a run, by its folder: trials with equal settings share it.
+    _waiting: dict[Path, list[_UnderWay]] = field(default_factory=dict)
+    _n_failed: int | None = 0  # trials since the start; None after a success
 
     @property
     def trials(self) -> list[FrozenTrial]:
-        """The trials so far, by number; none beyond ``n_trials``."""
-        return self.study.get_trials(deepcopy=False)[: self.n_trials]
+        """The trials so far, by number; none beyond those that were asked for."""
+        return self.study.get_trials(deepcopy=False)[: self.tuning.n_trials]
 
     @property
     def is_done(self) -> bool:
         """Whether every trial has ended."""
-        return sum(each.state.is_finished() for each in self.trials) == self.n_trials
+        return sum(each.state.is_finished() for each in self.trials) == self.tuning.n_trials
 
     @property
     def n_at_optimum(self) -> int:
@@ -268,7 +260,7 @@ class Search:
         while not self.is_saturated:
             trials = self.trials
             if all(trial.state != TrialState.WAITING for trial in trials):
-                if len(trials) == self.n_trials:
+                if len(trials) == self.tuning.n_trials:
                     return None
                 suggestions = self.suggestions
                 self.study.enqueue_trial(suggestions.fixed if trials else suggestions.first)
@@ -292,7 +284,7 @@ class Search:
         except UserError as error:
             self._fail(each, f"seed {run.seed}: {error}")
             return
-        self._failures = None
+        self._n_failed = None
         value = self.tuning.value([one.figure for one in each.runs.values()])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a step reported before a kill
@@ -324,9 +316,9 @@ class Search:
         """End a trial with a failed run; samplers treat it as one of the worst."""
         each.trial.set_user_attr(FAILURE, reason)
         self._end(each, None, reason)
-        if self._failures is not None:
-            self._failures.append(reason)
-            if len(self._failures) >= MOST_FAILURES:
+        if self._n_failed is not None:
+            self._n_failed += 1
+            if self._n_failed >= MOST_FAILURES:
                 raise UserError(f"all of the first {MOST_FAILURES} trials failed; {reason}")
 
     def _end(self, each: _UnderWay, value: float | None, reason: str = "") -> None:
@@ -392,8 +384,10 @@ def open_storage(root: Path) -> BaseStorage:
         content = path.read_bytes()
         if whole := content.rfind(b"\n") + 1 - len(content):  # the end of a write before a kill
             os.truncate(path, len(content) + whole)
+    for lock in root.glob(f"{OWN_FILE}.lock*"):
+        lock.unlink()  # of a process that was killed
     try:
-        storage = JournalStorage(JournalFileBackend(str(path), _LockedAlready(str(path))))
+        storage = JournalStorage(JournalFileBackend(str(path), JournalFileOpenLock(str(path))))
         studies = storage.get_all_studies()
     except (ValueError, LookupError, TypeError, AssertionError) as error:
         raise UserError(f"{path} is damaged: {one_line(error)}") from error
@@ -402,13 +396,3 @@ def open_storage(root: Path) -> BaseStorage:
             other = f"holds the Optuna study {study.study_name} of another program"
             raise UserError(f"{path} {other}: give this search another --name")
     return storage
-
-
-class _LockedAlready(JournalFileOpenLock):
-    """No further lock: the process holds that of the folder, which a kill gives back."""
-
-    def acquire(self) -> bool:
-        return True
-
-    def release(self) -> None:
-        pass

@@ -11,7 +11,7 @@ import hashlib
 import warnings
 import zlib
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from rl_yardstick.tuning.search_spaces import SearchSpace, corners
 from rl_yardstick.tuning.tuning_spec import TuningSpec
 
 
+@dataclass(eq=False)
 class SeededSampler(BaseSampler):
     """A new sampler of Optuna for each trial, and for each independently drawn parameter.
 
@@ -41,19 +42,18 @@ class SeededSampler(BaseSampler):
     parallel trials do not try the same settings.
     """
 
-    def __init__(self, tuning: TuningSpec) -> None:
-        self._tuning = tuning
+    tuning: TuningSpec
 
     def _made(self, *numbers: int) -> BaseSampler:
-        seeds = np.random.SeedSequence([self._tuning.seed, *numbers])
+        seeds = np.random.SeedSequence([self.tuning.seed, *numbers])
         seed = int(seeds.generate_state(1)[0])
-        if self._tuning.sampler == "random":
+        if self.tuning.sampler == "random":
             return RandomSampler(seed=seed)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)  # of ``group``, since 2.8
             return TPESampler(
                 seed=seed,
-                n_startup_trials=self._tuning.n_startup_trials,
+                n_startup_trials=self.tuning.n_startup_trials,
                 n_ei_candidates=24,
                 multivariate=True,
                 group=True,
@@ -87,6 +87,7 @@ class Suggestions:
         space: the search space, widened if necessary to include the shipped settings.
         first: the parameters of the first trial, which has the shipped settings.
         fixed: the parameters of settings that the user has fixed.
+        n_free: the number of parameters to choose.
     """
 
     def __init__(self, tuning: TuningSpec, space: SearchSpace, shipped: Mapping[str, Any]) -> None:
@@ -96,11 +97,7 @@ class Suggestions:
         dimensions = [each for each in self.space.entries.values() if given.issuperset(each.keys)]
         names = [name for each in dimensions for name in each.distributions]
         self.fixed = {name: self.first[name] for name in names if name in self.first}
-
-    @property
-    def n_free(self) -> int:
-        """The number of parameters to choose."""
-        return len(self.space.distributions.keys() - self.fixed.keys())
+        self.n_free = len(self.space.distributions.keys() - self.fixed.keys())
 
     def entry(self, trial: Trial) -> dict[str, Any]:
         """The hyperparameters of a trial."""

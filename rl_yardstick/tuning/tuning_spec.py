@@ -63,11 +63,6 @@ class TuningSpec:
         return self.figure in (*COSTS, STEPS)
 
     @property
-    def is_judged_by_study(self) -> bool:
-        """Whether the verdicts of a study are about the figure and statistic of the search."""
-        return self.objective == "mean" and self.figure != STEPS
-
-    @property
     def seeds(self) -> tuple[int, ...]:
         """The seeds of every trial, in their common order."""
         order = np.random.default_rng(self.seed).permutation(self.study.n_seeds)
@@ -102,7 +97,7 @@ class TuningSpec:
         if self.until_decided:
             if not self.retest:
                 raise UserError("--until-decided is about the re-test: leave out --retest 0")
-            if not self.is_judged_by_study:
+            if self.objective != "mean" or self.figure == STEPS:
                 raise UserError(
                     "--until-decided decides means of scores, returns or regrets: leave it out, or "
                     f"--objective {self.objective} --metric {self.figure}"
