@@ -10,7 +10,7 @@ from typing import Any
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.envs.warehouse import RandomWarehouseEnv
 from rl_yardstick.mdp import policy_iteration, value_iteration
-from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
+from rl_yardstick.pipeline.environments import make_envs, make_training_env
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.sampled import evaluate
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -36,7 +36,7 @@ def evaluations(env_id: str, *, greedily: bool) -> dict[str, Contender]:
     ]
     for agent in agents:
         agent.learn(STEPS)
-    env = make_evaluation_env(spec, 1)
+    env = make_envs(spec, 1)
     turns = cycle(agents)
     return {
         f"{EPISODES} episodes": seconds(

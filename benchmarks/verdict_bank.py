@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.commands.train import build_parser, spec_from_flags
-from rl_yardstick.pipeline.environments import make_evaluation_env
+from rl_yardstick.pipeline.environments import make_envs
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.sampled import SampledEvaluator
 from rl_yardstick.pipeline.training import make_agent
@@ -69,7 +69,7 @@ def scores_of(env_id: str, algo: str, n_steps: int, most: int) -> NDArray[np.flo
         typed += ["--engine", "compiled", "--device", "cpu"]
     first = spec_from_flags(build_parser().parse_args(typed))
     n_runs = N_NETWORKS if ALGORITHMS[algo].family == "library" else FEWER.get(env_id, N_RUNS)
-    eval_env, exact = make_evaluation_env(first, first.n_eval_envs), exact_evaluator(first)
+    eval_env, exact = make_envs(first, first.n_eval_envs), exact_evaluator(first)
     scores: list[float] = []
     for seed in range(min(n_runs, most)):
         spec = first.changed(seed=seed)

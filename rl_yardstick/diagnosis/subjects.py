@@ -343,19 +343,19 @@ class ScriptSubject(Subject):
         return ScriptModel(partial(self.function, make_env=make, **settings), trained.record)
 
 
+@dataclass
 class ScriptModel:
     """What a function trains, asked as the library's models are."""
 
+    train: Callable[..., Any]
+    record: Record
     policy, num_timesteps = None, 0
-
-    def __init__(self, train: Callable[..., Any], record: Record) -> None:
-        self._train, self._record = train, record
 
     def learn(self, steps: int, **_: Any) -> None:
         """Train for that many more steps, from the beginning."""
         self.num_timesteps += steps
-        self._record.clear()
-        agent = self._train(steps=self.num_timesteps)
+        self.record.clear()
+        agent = self.train(steps=self.num_timesteps)
         if not callable(getattr(agent, "act", None)):
             raise UserError("a script's function must return something with act(obs)")
         self._act, self.values = agent.act, getattr(agent, "values", None)

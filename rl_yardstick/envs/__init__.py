@@ -14,31 +14,16 @@ from gymnasium.envs import registration
 PATH_MULTIPLE, LARGEST_PATH = 10, 2**24
 DEFAULT_PULLS = 1000  # stands in for a bandit's own `pulls`, likewise
 
-
-def _own_limit(attribute: str, multiple: int, instead_of: int) -> registration.WrapperSpec:
-    return registration.WrapperSpec(
-        name="OwnTimeLimit",
-        entry_point="rl_yardstick.envs.wrappers:own_time_limit",
-        kwargs={"attribute": attribute, "multiple": multiple, "instead_of": instead_of},
-    )
-
-
 DARK_WAREHOUSE = {
     "desc": (".......", "#.#.#.#", "#.#.#.#", "#S#G#.#"),
     "shelf_reward": -1,
     "random_start": True,
     "observation": "neighbours",
 }
-# Entry points in `rl_yardstick.envs.bandits`.
-BANDITS = {
-    "BernoulliBandit-v0": "clicks:BernoulliBandit",
-    "GaussianBandit-v0": "gaussian:GaussianBandit",
-    "LinearBandit-v0": "linear:LinearBandit",
-    "ReplayBandit-v0": "logged:ReplayBandit",
-    "SegmentBandit-v0": "clicks:SegmentBandit",
-}
 # Entry points in `rl_yardstick.envs`, and time limits.
-FINITE = {
+ENVIRONMENTS = {
+    "DarkWarehouse-v0": ("warehouse:WarehouseEnv", 100),
+    "RandomWarehouse-v0": ("warehouse:RandomWarehouseEnv", PATH_MULTIPLE * LARGEST_PATH),
     "DeepSea-v0": ("textbook.grids:DeepSeaEnv", 1000),
     "DynaMaze-v0": ("textbook.grids:DynaMazeEnv", 100),
     "GamblersProblem-v0": ("textbook.dynamic_programming:GamblersProblemEnv", 1000),
@@ -53,31 +38,29 @@ FINITE = {
     "Tiger-v0": ("pomdp:TigerEnv", 10),
     "Warehouse-v0": ("warehouse:WarehouseEnv", 1000),
     "MineMaze-v0": ("mine_maze:MineMazeEnv", 100),
+    "BernoulliBandit-v0": ("bandits.clicks:BernoulliBandit", DEFAULT_PULLS),
+    "GaussianBandit-v0": ("bandits.gaussian:GaussianBandit", DEFAULT_PULLS),
+    "LinearBandit-v0": ("bandits.linear:LinearBandit", DEFAULT_PULLS),
+    "ReplayBandit-v0": ("bandits.logged:ReplayBandit", DEFAULT_PULLS),
+    "SegmentBandit-v0": ("bandits.clicks:SegmentBandit", DEFAULT_PULLS),
 }
 
 
 def register_environments() -> None:
     """Register all environments of this project; those that are registered stay as they are."""
     home = "rl_yardstick.envs"
-    _register("DarkWarehouse-v0", f"{home}.warehouse:WarehouseEnv", 100, kwargs=DARK_WAREHOUSE)
-    _register(
-        "RandomWarehouse-v0",
-        f"{home}.warehouse:RandomWarehouseEnv",
-        PATH_MULTIPLE * LARGEST_PATH,
-        additional_wrappers=(
-            _own_limit("shortest_path_length", PATH_MULTIPLE, PATH_MULTIPLE * LARGEST_PATH),
-        ),
-    )
-    for env_id, (place, steps) in FINITE.items():
-        _register(env_id, f"{home}.{place}", steps)
-    for env_id, place in BANDITS.items():
-        limit = _own_limit("pulls", 1, DEFAULT_PULLS)
-        _register(env_id, f"{home}.bandits.{place}", DEFAULT_PULLS, additional_wrappers=(limit,))
-
-
-def _register(env_id: str, entry_point: str, limit: int, **given: Any) -> None:
-    if env_id not in registration.registry:
-        registration.register(env_id, entry_point, max_episode_steps=limit, **given)
+    for env_id, (place, steps) in ENVIRONMENTS.items():
+        if env_id in registration.registry:
+            continue
+        given: dict[str, Any] = {"kwargs": DARK_WAREHOUSE} if env_id[:4] == "Dark" else {}
+        if place.startswith("bandits.") or env_id == "RandomWarehouse-v0":
+            own = {"attribute": "pulls", "multiple": 1, "instead_of": steps}
+            if env_id == "RandomWarehouse-v0":
+                own |= {"attribute": "shortest_path_length", "multiple": PATH_MULTIPLE}
+            limit = f"{home}.wrappers:own_time_limit"
+            wrapper = registration.WrapperSpec("OwnTimeLimit", limit, own)
+            given = {"additional_wrappers": (wrapper,)}
+        registration.register(env_id, f"{home}.{place}", max_episode_steps=steps, **given)
 
 
 register_environments()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -152,6 +152,11 @@ LETTER_COLOURS: dict[str, Colour] = {
 }
 
 
+ROBOT, TRAIL = "R", "*"
+# What a terminal of common size shows; of larger maps the part around the robot is drawn.
+MAX_ROWS, MAX_COLUMNS = 40, 100
+
+
 @dataclass(frozen=True)
 class Scene:
     """A moment of an episode in a grid world; cells are numbered row by row."""
@@ -167,13 +172,25 @@ class Scene:
         """Row and column of a cell."""
         return divmod(cell, len(self.rows[0]))
 
+    def text(self) -> str:
+        """The title on a line, then the map: ``R`` the robot, ``*`` where it has been."""
+        robot_row, robot_column = self.place(self.robot)
+        rows = _window(robot_row, len(self.rows), MAX_ROWS)
+        columns = _window(robot_column, len(self.rows[0]), MAX_COLUMNS)
+        trail = {self.place(cell) for step in self.steps for cell in step}
+        marks = {(row, column): TRAIL for row, column in trail if self.rows[row][column] != "S"}
+        marks[robot_row, robot_column] = ROBOT
+        title = f"({self.title})"
+        if len(rows) < len(self.rows) or len(columns) < len(self.rows[0]):
+            title += f" rows {rows[0]}-{rows[-1]}, columns {columns[0]}-{columns[-1]}"
+        lines = ["".join(marks.get((r, c), self.rows[r][c]) for c in columns) for r in rows]
+        return "\n".join([title, *lines]) + "\n"
 
-@dataclass(frozen=True)
-class Chart:
-    """A picture made of shapes, the hindmost first, all in pixels."""
 
-    size: tuple[int, int]
-    shapes: Sequence[Shape]
+def _window(centre: int, length: int, most: int) -> range:
+    """At most ``most`` indices around ``centre``."""
+    first = max(0, min(centre - most // 2, length - most))
+    return range(first, min(first + most, length))
 
 
 class Renderer(ABC):
@@ -221,15 +238,15 @@ class Renderer(ABC):
             self._window = None
 
 
-class ChartRenderer(Renderer):
-    """Shows charts."""
+class BarsRenderer(Renderer):
+    """Shows bars."""
 
-    def paint(self, scene: Chart) -> pygame.Surface:
+    def paint(self, scene: Bars) -> pygame.Surface:
         import pygame
 
-        picture = pygame.Surface(scene.size)
+        picture = pygame.Surface((WIDTH, TITLE + ROW * len(scene.bars)))
         picture.fill(FLOOR)
-        for shape in scene.shapes:
+        for shape in scene.shapes():
             _draw(picture, shape, 1)
         return picture
 
@@ -395,7 +412,7 @@ class ShownEnv(gym.Env[Any, Any], ABC):
             gym.logger.warn("render() does nothing: the environment was made without render_mode")
             return None
         if self.render_mode == "ansi":
-            return self._text()
+            return self._picture().text()
         if self._renderer is None:
             title = type(self).__name__ if self.spec is None else self.spec.id
             self._renderer = self._make_renderer(self.metadata["render_fps"], title)
@@ -411,16 +428,12 @@ class ShownEnv(gym.Env[Any, Any], ABC):
             self._renderer = None
 
     @abstractmethod
-    def _text(self) -> str:
-        """The state as text."""
-
-    @abstractmethod
-    def _picture(self) -> Any:
-        """The state as the scene that the renderer paints."""
+    def _picture(self) -> Scene | Bars:
+        """The state as the renderer paints it."""
 
     def _make_renderer(self, fps: int, title: str) -> Renderer:
-        """The renderer of the pictures, charts by default."""
-        return ChartRenderer(fps, title)
+        """The renderer of the pictures, by default of bars."""
+        return BarsRenderer(fps, title)
 
 
 # --- amounts: the arms of bandits, and states without a map ---------------------------------------
@@ -476,8 +489,8 @@ class Bars:
             lines.append(f"{name}  {bar.numbers}  {''.join(cells)}".rstrip())
         return "\n".join(lines) + "\n"
 
-    def chart(self) -> Chart:
-        """The picture: names and numbers above each bar."""
+    def shapes(self) -> list[Shape]:
+        """The picture, the hindmost first, in pixels: names and numbers above each bar."""
         length, right = WIDTH - 2 * MARGIN, WIDTH - MARGIN
         shapes: list[Shape] = [Label(self.title, (MARGIN, TITLE / 2), TEXT + 4, INK, align=0)]
         for i, bar in enumerate(self.bars):
@@ -494,18 +507,4 @@ class Bars:
             if bar.mark is not None:
                 place = MARGIN + length * self.part(bar.mark)
                 shapes.append(Box((place - 2, top + 15), (4, 22), 2, ORANGE))
-        return Chart((WIDTH, TITLE + ROW * len(self.bars)), shapes)
-
-
-class BarsEnv(ShownEnv):
-    """An environment that is shown as bars."""
-
-    @abstractmethod
-    def _bars(self) -> Bars:
-        """The state as bars."""
-
-    def _text(self) -> str:
-        return self._bars().text()
-
-    def _picture(self) -> Chart:
-        return self._bars().chart()
+        return shapes

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from abc import abstractmethod
 from array import array
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -336,37 +335,15 @@ class GridDynamics:
         return table
 
 
-ROBOT = "R"
-TRAIL = "*"
-# What a terminal of common size shows; of larger maps the part around the robot is drawn.
-MAX_ROWS = 40
-MAX_COLUMNS = 100
-
-
-def render_text(scene: Scene) -> str:
-    """The latest action on a line, then the map: ``R`` the robot, ``*`` where it has been."""
-    robot_row, robot_column = scene.place(scene.robot)
-    rows = _window(robot_row, len(scene.rows), MAX_ROWS)
-    columns = _window(robot_column, len(scene.rows[0]), MAX_COLUMNS)
-    trail = {scene.place(cell) for step in scene.steps for cell in step}
-    marks = {(row, column): TRAIL for row, column in trail if scene.rows[row][column] != START}
-    marks[robot_row, robot_column] = ROBOT
-    title = f"({scene.title})"
-    if len(rows) < len(scene.rows) or len(columns) < len(scene.rows[0]):
-        title += f" rows {rows[0]}-{rows[-1]}, columns {columns[0]}-{columns[-1]}"
-    lines = [title]
-    lines += ["".join(marks.get((row, c), scene.rows[row][c]) for c in columns) for row in rows]
-    return "\n".join(lines) + "\n"
-
-
-def _window(centre: int, length: int, most: int) -> range:
-    """At most ``most`` indices around ``centre``."""
-    first = max(0, min(centre - most // 2, length - most))
-    return range(first, min(first + most, length))
-
-
 # Longer chains are drawn in several rows, read as lines of text are.
 LONGEST_ROW = 50
+
+
+def in_rows(letters: str) -> tuple[str, ...]:
+    """A chain of letters as a map, in rows of equal length."""
+    length = min(len(letters), LONGEST_ROW)
+    starts = range(0, len(letters), length)
+    return tuple(letters[start : start + length].ljust(length, "#") for start in starts)
 
 
 class MapEnv(FiniteEnv):
@@ -379,31 +356,12 @@ class MapEnv(FiniteEnv):
         """The cell of a state, counted row by row: by default states are cells."""
         return state
 
-    def _text(self) -> str:
-        return render_text(self._picture())
-
     def _picture(self) -> Scene:
         name = "start" if self.last_action is None else self.action_names[self.last_action]
         return Scene(self.rows, self.cell_of(self.s), title=name)
 
     def _make_renderer(self, fps: int, title: str) -> GridRenderer:
         return GridRenderer(self.rows, fps, title)
-
-
-class ChainEnv(MapEnv):
-    """An environment whose states lie side by side."""
-
-    @abstractmethod
-    def letters(self) -> str:
-        """The letter of each state, in order."""
-
-    @property
-    def rows(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The chain, in rows of equal length."""
-        letters = self.letters()
-        length = min(len(letters), LONGEST_ROW)
-        starts = range(0, len(letters), length)
-        return tuple(letters[start : start + length].ljust(length, "#") for start in starts)
 
 
 class GridWorld(MapEnv, MaskedFiniteEnv):
@@ -426,6 +384,7 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
     """
 
     action_names: ClassVar[tuple[str, ...]] = ("up", "down", "left", "right")
+    is_stationary = True  # whether the dynamics do not change over time: the model always holds
 
     def __init__(
         self,
@@ -443,17 +402,13 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
             letter for letter, tile in tiles.items() if not (tile.blocked or tile.terminated)
         ]
         self.map = GridMap.read(desc, tiles, passable)
+        self.rows = self.map.rows
         self.dynamics = GridDynamics(self.map, tiles, edge, slip)
         super().__init__(self.dynamics.n_states, len(MOVES), render_mode)
         self._slip_thresholds = np.cumsum(self.dynamics.outcome_prob).tolist()
         self.s = self.map.start
         self._bumped = False  # in the latest step
         self._steps: set[tuple[int, int]] = set()  # those of the episode, where it is rendered
-
-    @property
-    def rows(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The rows of the map."""
-        return self.map.rows
 
     def _draw_start(self) -> int:
         starts, thresholds = self._starts
@@ -497,16 +452,6 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
         distribution, starts = np.zeros(self.dynamics.n_states), self._starts[0]
         distribution[starts] = summing_to_one(np.full(len(starts), 1 / len(starts)))
         return distribution
-
-    @property
-    def is_stationary(self) -> bool:
-        """Whether the dynamics do not change over time, so that their model always holds."""
-        return True
-
-    @property
-    def desc(self) -> NDArray[np.bytes_]:
-        """The map as FrozenLake holds it, single letters of shape (rows, columns)."""
-        return np.frombuffer(self.map.codes, "S1").reshape(self.map.n_rows, self.map.n_columns)
 
     @property
     def shortest_path_length(self) -> int:

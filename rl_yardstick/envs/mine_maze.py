@@ -93,11 +93,7 @@ class MineMazeEnv(GridWorld):
             "P": Tile(step, bonus=check_number("power_reward", power_reward)),
             "G": Tile(step + goal, terminated=True),
         }
+        edge = Tile(step, blocked=True)
         super().__init__(
-            desc,
-            tiles,
-            edge=Tile(step, blocked=True),
-            slip=slip,
-            random_start=random_start,
-            render_mode=render_mode,
+            desc, tiles, edge, slip=slip, random_start=random_start, render_mode=render_mode
         )

@@ -7,7 +7,7 @@ and compiled training need no code for noise.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.envs.argument_checks import check_number
 from rl_yardstick.envs.finite_env import summing_to_one
-from rl_yardstick.envs.grid import ChainEnv, MapEnv
+from rl_yardstick.envs.grid import MapEnv
 from rl_yardstick.mdp.transition_model import Floats, Ints, TransitionModel
 
 
@@ -73,7 +73,7 @@ LISTEN, OPEN_LEFT, OPEN_RIGHT = 0, 1, 2
 SILENCE, HEARD_LEFT, HEARD_RIGHT = 0, 1, 2
 
 
-class TigerEnv(ChainEnv):
+class TigerEnv(MapEnv):
     """Behind one of two doors waits a tiger; who listens longer knows better which.
 
     ## Description
@@ -113,6 +113,7 @@ class TigerEnv(ChainEnv):
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
     """
 
+    rows = ("MM",)  # the two doors; the robot stands where the tiger is
     action_names: ClassVar[tuple[str, ...]] = ("listen", "open left", "open right")
 
     def __init__(self, accuracy: float = 0.85, render_mode: str | None = None) -> None:
@@ -128,10 +129,6 @@ class TigerEnv(ChainEnv):
         """What was heard last."""
         heard: NDArray[Any] = _tiger(self.accuracy).reading[states]
         return heard
-
-    def letters(self) -> str:
-        """The two doors; the robot stands where the tiger is."""
-        return "MM"
 
     def cell_of(self, state: int) -> int:
         return int(_tiger(self.accuracy).hidden[state])
@@ -277,10 +274,6 @@ def _hallway() -> World:
 
 def _wall_readings(walls: list[bool]) -> NDArray[np.float64]:
     """The chances of readings 0 to 15, for walls in front, to the right, behind, to the left."""
-    chances = np.ones(1)
-    for is_wall in walls:
-        felt = SEES_WALL if is_wall else 1 - SEES_NO_WALL
-        chances = np.concatenate(
-            [chances[:, None] * (1 - felt), chances[:, None] * felt], 1
-        ).ravel()
-    return chances
+    felt = np.array([SEES_WALL if is_wall else 1 - SEES_NO_WALL for is_wall in walls])
+    chances: Any = reduce(np.kron, np.stack([1 - felt, felt], axis=1))
+    return np.asarray(chances)

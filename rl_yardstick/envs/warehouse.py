@@ -181,13 +181,9 @@ class WarehouseEnv(GridWorld):
             "S": aisle,
             "G": Tile(check_number("goal_reward", goal_reward), terminated=True),
         }
+        edge = replace(aisle, blocked=True)
         super().__init__(
-            desc,
-            tiles,
-            edge=replace(aisle, blocked=True),
-            slip=slip,
-            random_start=random_start,
-            render_mode=render_mode,
+            desc, tiles, edge, slip=slip, random_start=random_start, render_mode=render_mode
         )
         if observation == "position":
             self.observation_space = spaces.Box(0, 1, (2,), np.float32)
@@ -257,13 +253,6 @@ class RandomWarehouseEnv(WarehouseEnv):
         observation: str = "discrete",
         render_mode: str | None = None,
     ) -> None:
-        super().__init__(
-            random_warehouse(size, shelf_density, map_seed),
-            shelf_reward=shelf_reward,
-            step_reward=step_reward,
-            goal_reward=goal_reward,
-            slip=slip,
-            random_start=random_start,
-            observation=observation,
-            render_mode=render_mode,
-        )
+        rows = random_warehouse(size, shelf_density, map_seed)
+        given = shelf_reward, step_reward, goal_reward, slip, random_start, observation, render_mode
+        super().__init__(rows, *given)

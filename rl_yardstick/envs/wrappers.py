@@ -227,11 +227,8 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
         observed: Any = env.observation_space
         self._seen = bijection_of(observed, observations)
         self._done = bijection_of(env.action_space, actions)
-        if (
-            self._seen is None
-            and self._done is None
-            and type(observed).__name__ not in observations
-        ):
+        stays = type(observed).__name__ in observations
+        if self._seen is None and self._done is None and not stays:
             raise ValueError(
                 "FlattenToDiscrete needs MultiDiscrete, a Tuple or Dict, MultiBinary, Discrete or "
                 f"a Box of whole numbers, of at most {MOST_MEMBERS:,} members, not {observed}"

@@ -116,9 +116,7 @@ class StateCallback(BlockCallback):
         super().__init__()
         self.run, self.resumes, self.others, self.clock = run, resumes, others, clock
         self.process = {"run": run, "exact": judge.exact, "eval_env": judge.env}
-        self.evaluator: dict[str, Any] = (
-            {} if judge.exact is not None else {"evaluator": judge.evaluator}
-        )
+        self.evaluator = None if judge.exact is not None else judge.evaluator
         self.is_possible = True
         self.due_at = time.monotonic() + self.shortest_pause
 
@@ -137,7 +135,7 @@ class StateCallback(BlockCallback):
         self.run.stop.check()
 
     def _roots(self) -> dict[str, Any]:
-        return roots_of(self.model, self.others, **self.process, **self.evaluator)
+        return roots_of(self.model, self.others, **self.process, evaluator=self.evaluator)
 
     def _save(self) -> None:
         begun = time.monotonic()

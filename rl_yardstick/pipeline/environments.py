@@ -83,13 +83,10 @@ def creator_of(env_id: str) -> Any:
 # --- training and evaluation: their arguments and wrappers ----------------------------------------
 
 
-def training_kwargs(spec: TrainSpec) -> dict[str, Any]:
-    """Arguments of the training environments."""
-    return {**spec.env_kwargs, **spec.train_env_kwargs}
-
-
-def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
-    """Arguments of the evaluation environments, whose episodes always end."""
+def kwargs_of(spec: TrainSpec, training: bool = False) -> dict[str, Any]:
+    """Arguments of training's environments, or of evaluations', whose episodes always end."""
+    if training:
+        return {**spec.env_kwargs, **spec.train_env_kwargs}
     kwargs = {**spec.env_kwargs, **spec.eval_env_kwargs}
     registered = gym.spec(spec.env_id).max_episode_steps
     if kwargs.get("max_episode_steps", registered) in (None, -1):  # -1: no limit
@@ -191,8 +188,8 @@ def _wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = No
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> Env:
     """Make one wrapped environment, outside any VecEnv; ``extra`` are further arguments of it."""
-    kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
-    return _wrapped(spec, make_env(spec.env_id, {**kwargs, **extra}), training)
+    env = make_env(spec.env_id, {**kwargs_of(spec, training), **extra})
+    return _wrapped(spec, env, training)
 
 
 def first_seed(spec: TrainSpec) -> int:
@@ -204,36 +201,24 @@ def first_seed(spec: TrainSpec) -> int:
 
 
 def make_training_env(spec: TrainSpec, folder: Path | None, appending: bool = False) -> Any:
-    """Make the training environments, each in a Monitor that writes into the folder."""
-    monitor = {"override_existing": False} if appending else {}
-    return _make_vec_env(spec, True, spec.n_envs, folder, {**spec.monitor_kwargs, **monitor})
+    """Make the training VecEnv; Monitors write into the folder, behind what is there if asked."""
+    monitor = {**spec.monitor_kwargs, **({"override_existing": False} if appending else {})}
+    return make_envs(spec.changed(monitor_kwargs=monitor), spec.n_envs, folder, training=True)
 
 
-def make_evaluation_env(
+def make_envs(
     spec: TrainSpec,
     n_envs: int,
+    folder: Path | None = None,
     wrap_innermost: Callable[[Env], Env] | None = None,
-    monitor_folder: Path | None = None,
+    training: bool = False,
     **extra: Any,
 ) -> Any:
-    """Make the evaluation VecEnv.
+    """Make a VecEnv, for evaluations or for training.
 
-    ``wrap_innermost`` is put around each environment, inside all other wrappers; Monitors write
-    into ``monitor_folder``; ``extra`` are further arguments of the environments.
+    Monitors write into ``folder``; ``wrap_innermost`` is put around each environment, inside all
+    other wrappers; ``extra`` are further arguments of the environments.
     """
-    monitor = spec.monitor_kwargs
-    return _make_vec_env(spec, False, n_envs, monitor_folder, monitor, wrap_innermost, **extra)
-
-
-def _make_vec_env(
-    spec: TrainSpec,
-    training: bool,
-    n_envs: int,
-    folder: Path | None,
-    monitor_kwargs: dict[str, Any],
-    wrap_innermost: Callable[[Env], Env] | None = None,
-    **extra: Any,
-) -> Any:
     from stable_baselines3.common import vec_env
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.env_util import make_vec_env
@@ -249,9 +234,9 @@ def _make_vec_env(
         make,
         n_envs,
         first_seed(spec) if training else None,
-        env_kwargs=training_kwargs(spec) if training else evaluation_kwargs(spec),
+        env_kwargs=kwargs_of(spec, training),
         monitor_dir=None if folder is None else str(folder),
-        monitor_kwargs=monitor_kwargs,
+        monitor_kwargs=spec.monitor_kwargs,
         wrapper_class=lambda env: _wrapped(spec, env, training, folder),
         vec_env_cls=vec_env.SubprocVecEnv if in_processes else vec_env.DummyVecEnv,
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from rl_yardstick.pipeline.environments import make_evaluation_env
+from rl_yardstick.pipeline.environments import make_envs
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.models import Model, take_statistics
 
@@ -37,7 +37,7 @@ def playing_env(
     if mode == "rgb_array":
         # Rendering into memory needs no display, but SDL complains if there is none.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    extra = {} if mode is None else {"render_mode": mode}
+    extra: dict[str, Any] = {} if mode is None else {"render_mode": mode}
     # A VecEnv resets a finished environment at once, so frames are stored before that.
     wrap_innermost = None
     if mode in ("ansi", "rgb_array"):
@@ -45,7 +45,7 @@ def playing_env(
 
         wrap_innermost = partial(RenderCollection, pop_frames=True, reset_clean=False)
     spec = model.spec
-    env: VecEnv = make_evaluation_env(spec, n_envs, wrap_innermost, monitor_folder, **extra)
+    env: VecEnv = make_envs(spec, n_envs, monitor_folder, wrap_innermost, **extra)
     if mode is not None and mode not in env.get_attr("metadata")[0].get("render_modes", []):
         raise UserError(f"{spec.env_id} cannot be rendered as {mode}")
     if model.statistics is not None:

@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import threading
-import time
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
@@ -33,10 +32,9 @@ MAX_RECORD = 100_000_000  # bytes of run.json, which holds the rows of maps
 
 
 class Stop:
-    """The number of the first SIGINT or SIGTERM, or 0; the second signal ends the process."""
+    """Notices the first SIGINT or SIGTERM; the second signal ends the process."""
 
-    def __init__(self) -> None:
-        self.number = 0
+    number = 0  # of the first signal
 
     def listen(self) -> Self:
         """Take over the signals, in a process's main thread; elsewhere Python delivers none."""
@@ -134,8 +132,6 @@ class Run:
         """Write what the run is about to do: settings for rl_zoo3, and ``run.json``."""
         import yaml
 
-        if time.localtime().tm_year < 1980:
-            raise UserError("the clock of this machine stands before 1980, where zip files begin")
         settings = self.path / spec.env_name
         settings.mkdir(exist_ok=True)
         # rl_zoo3's tools use env_kwargs in args.yml before those in config.yml.

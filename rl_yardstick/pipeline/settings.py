@@ -44,8 +44,10 @@ SPECIAL = (*BUDGETS, *COMPONENTS, *ENV_KWARGS, *_OTHERS)
 _SET_ELSEWHERE = {
     "action_noise": "noise_type and noise_std",
     "tensorboard_log": "--tensorboard-log",
+    "seed": "--seed",
+    "device": "--device",
+    "verbose": "--verbose",
 }
-_SET_ELSEWHERE |= {"seed": "--seed", "device": "--device", "verbose": "--verbose"}
 _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 
 
@@ -186,13 +188,9 @@ _INSIDE = {
 }
 _WITH_TWO_NETWORKS = ("ppo", "ppo_lstm", "ppo_mask", "trpo", "a2c")
 # What the first versions, which sampled gamma itself, set without sampling it.
-_NO_ORTHOGONAL, _AUTO_ENTROPY = (
-    {"ortho_init": False},
-    {"ent_coef": "auto", "target_entropy": "auto"},
-)
 _UNSAMPLED: Mapping[str, dict[str, Any]] = {
-    **dict.fromkeys(("ppo", "ppo_lstm", "trpo"), _NO_ORTHOGONAL),
-    **dict.fromkeys(("sac", "tqc"), _AUTO_ENTROPY),
+    **{algo: {"ortho_init": False} for algo in ("ppo", "ppo_lstm", "trpo")},
+    **{algo: {"ent_coef": "auto", "target_entropy": "auto"} for algo in ("sac", "tqc")},
 }
 
 

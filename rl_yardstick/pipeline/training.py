@@ -120,11 +120,13 @@ class Training:
         frequencies = callbacks.evaluation_frequencies(spec, agent, is_bandit and exact is None)
         critics = None
         if spec.diagnose:
-            is_evaluated = max(frequencies) > 0
-            found = recorder_of(run.path / "diagnosis.csv", spec, agent, is_evaluated=is_evaluated)
-            critics = found if not isinstance(found, str) else None
-            if critics is None:
+            found: Any = "there are no evaluations during this training"
+            if max(frequencies) > 0:
+                found = recorder_of(run.path / "diagnosis.csv", spec, agent)
+            if isinstance(found, str):
                 run.console.print(f"no diagnosis: {found}", style="dim", markup=False)
+            else:
+                critics = found
         maps = None
         if exact is not None and (spec.watch_learning or exact.layout is not None):
             maps = ValueMapRecorder(run.path / "value_maps.npz", exact)

@@ -196,8 +196,7 @@ def watch_of(
             f"{spec.algo} on {spec.env_id} has neither"
         )
     if spec.watch_episodes or (spec.eval_freq or 1) < 0:
-        flag = (
-            "--watch-episodes is for agents with tables" if spec.watch_episodes else "--eval-freq"
-        )
+        flag = "--watch-episodes is for agents with tables"
+        flag = flag if spec.watch_episodes else "--eval-freq"
         raise UserError(f"{flag}: {spec.algo} is shown at each evaluation")
     return None

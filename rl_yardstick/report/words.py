@@ -18,7 +18,6 @@ from rl_yardstick.experiments.plan import Seeds, TuningSeeds
 from rl_yardstick.experiments.study import COSTS, OF_TRAINING, StudySpec
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.evaluation.yardstick import bracket_mark
 from rl_yardstick.verdicts import Estimate, Pair, unseen_share
 
 if TYPE_CHECKING:
@@ -82,7 +81,8 @@ def optimum_words(environment: EnvironmentAnalysis) -> str:
     ends = [number(at_least), number(optimum)]
     if ends[0] == ends[1]:
         ends = [f"{at_least:,.3f}", f"{optimum:,.3f}"]
-    return f"{ends[0]} to {ends[1]} {bracket_mark(environment.optimum_is_proven)}"
+    mark = "" if environment.optimum_is_proven else "; the upper end is not proven"
+    return f"{ends[0]} to {ends[1]} (bracketed{mark})"
 
 
 def scale_words(environment: EnvironmentAnalysis) -> str:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from rl_yardstick.envs import drawing
 from rl_yardstick.envs.bandits import BernoulliBandit, GaussianBandit, ReplayBandit
-from rl_yardstick.envs.drawing import Bar, Bars, ChartRenderer, GridRenderer, Scene
+from rl_yardstick.envs.drawing import Bar, Bars, BarsRenderer, GridRenderer, Scene
 from rl_yardstick.envs.mine_maze import MineMazeEnv
 from rl_yardstick.envs.warehouse import WarehouseEnv
 
@@ -84,7 +84,7 @@ SCENES = {
 @pytest.mark.parametrize("name", [*SCENES, "arms"])
 def test_a_picture_is_as_it_was(name, tmp_path):
     if name == "arms":
-        found = ChartRenderer(10, "arms").pixels(BARS.chart())
+        found = BarsRenderer(10, "arms").pixels(BARS)
     else:
         found = GridRenderer(SCENES[name].rows, 10, "a map").pixels(SCENES[name])
     Image.fromarray(found).save(tmp_path / f"{name}.png", optimize=True)

@@ -81,7 +81,7 @@ def test_which_policy_an_agent_s_values_are_of():
     for algo in follows | maximises:
         spec = spec_of(algo, LAKE)
         agent = agent_of(algo, make_training_env(spec, None))
-        recorder = recorder_of(None, spec, agent, is_evaluated=True)
+        recorder = recorder_of(None, spec, agent)
         assert recorder.explores == (algo in follows), algo
         recorder.model = agent
         assert np.isfinite(recorder.figures()["v_error"]), algo
@@ -216,7 +216,7 @@ def test_cosine_and_signal_to_noise_of_multiples_of_the_exact_gradient():
 def test_where_states_look_alike_values_are_compared_and_rollouts_are_not():
     spec = spec_of("ppo", "ShortCorridor-v0")
     agent = agent_of("ppo", make_training_env(spec, None), device="cpu")
-    recorder = recorder_of(None, spec, agent, is_evaluated=True)
+    recorder = recorder_of(None, spec, agent)
     assert type(recorder) is CriticRecorder
     recorder.model = agent
     assert set(recorder.figures()) == {"v_error", "v_error_visited", "entropy"}

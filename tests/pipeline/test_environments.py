@@ -22,12 +22,11 @@ from rl_yardstick.pipeline.components import (
 )
 from rl_yardstick.pipeline.environments import (
     EVALUATION_TIME_LIMIT,
-    evaluation_kwargs,
-    make_evaluation_env,
+    kwargs_of,
+    make_envs,
     make_single_env,
     make_training_env,
     training_changes,
-    training_kwargs,
     with_files_read,
 )
 from rl_yardstick.pipeline.errors import UserError
@@ -64,10 +63,10 @@ def test_which_arguments_reach_training_and_which_evaluation(tmp_path):
     spec = world("Warehouse-v0", {**ENTRY, "n_envs": 2})
     shared = {"step_reward": -2}
     own = {"goal_reward": 60, "random_start": True, "max_episode_steps": 30}
-    assert training_kwargs(spec) == {**shared, **own}
+    assert kwargs_of(spec, training=True) == {**shared, **own}
     own = {"goal_reward": 50, "slip": 0.1, "max_episode_steps": 40}
-    assert evaluation_kwargs(spec) == {**shared, **own}
-    training, evaluation = make_training_env(spec, tmp_path), make_evaluation_env(spec, 3)
+    assert kwargs_of(spec) == {**shared, **own}
+    training, evaluation = make_training_env(spec, tmp_path), make_envs(spec, 3)
     assert (training.num_envs, evaluation.num_envs) == (2, 3)
     for env, goal_reward, limit in ((training, 60, 30), (evaluation, 50, 40)):
         single = make_single_env(spec, training=env is training)
@@ -101,7 +100,7 @@ def test_evaluation_always_has_a_time_limit():
         spec = world(env_id, entry)
         made = make_single_env(spec, training=True), make_training_env(spec, None).envs[0]
         assert [time_limit(env) for env in made] == [None] * 2
-        made = make_single_env(spec), make_evaluation_env(spec, 1).envs[0]
+        made = make_single_env(spec), make_envs(spec, 1).envs[0]
         assert [time_limit(env) for env in made] == [limit] * 2
 
 
@@ -117,7 +116,7 @@ WRAPPED = {
 def test_wrappers_stand_in_their_order():
     spec = world("FrozenLake-v1", WRAPPED)
     both = [OneHotObservation, TerminationReward]
-    training, evaluation = make_training_env(spec, None), make_evaluation_env(spec, 1)
+    training, evaluation = make_training_env(spec, None), make_envs(spec, 1)
     # Monitor is inside: it records the rewards of the environment itself.
     kinds = [[type(each) for each in layers(env.envs[0])] for env in (training, evaluation)]
     assert (kinds[0][:4], kinds[1][:3]) == ([ScaleReward, *both, Monitor], [*both, Monitor])
@@ -125,7 +124,7 @@ def test_wrappers_stand_in_their_order():
     # Rewards are changed for training, and recorded unchanged.
     scaled = {"env_kwargs": {"desc": ["SG"]}, "train_env_wrapper": WRAPPED["train_env_wrapper"]}
     spec = world("Warehouse-v0", scaled)
-    made = {50.0: make_training_env(spec, None), 100.0: make_evaluation_env(spec, 1)}
+    made = {50.0: make_training_env(spec, None), 100.0: make_envs(spec, 1)}
     for reward, env in made.items():
         env.reset()
         _, rewards, dones, infos = env.step([3])
@@ -134,7 +133,7 @@ def test_wrappers_stand_in_their_order():
 
 def test_normalisation_learns_in_training_alone_and_rewards_are_evaluated_as_they_are():
     spec = spec_of("ppo", "CartPole-v1", {"normalize": True, "gamma": 0.9, "n_envs": 2})
-    env, eval_env = make_training_env(spec, None), make_evaluation_env(spec, 1)
+    env, eval_env = make_training_env(spec, None), make_envs(spec, 1)
     for made, trains in ((env, True), (eval_env, False)):
         assert (made.norm_obs, made.norm_reward, made.training) == (True, trains, trains)
         assert made.gamma == 0.9

@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from rl_yardstick.agents import load_algorithm, policies
 from rl_yardstick.agents.policies import policy_matrix
 from rl_yardstick.mdp import policy_return, value_iteration
-from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
+from rl_yardstick.pipeline.environments import make_envs, make_training_env
 from rl_yardstick.pipeline.evaluation import judge
 from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
 from rl_yardstick.pipeline.evaluation.judge import by_histories, world_of_memory
@@ -61,7 +61,7 @@ def test_the_exact_return_is_that_of_the_agents_own_actions(
         exact = evaluator(agent, deterministic)
         policy = policy_matrix(agent, evaluator.observations, deterministic)
         np.testing.assert_allclose(policy.sum(axis=1), 1, atol=1e-6)
-        played = evaluate(agent, make_evaluation_env(spec, 50), n_episodes, 5, deterministic)
+        played = evaluate(agent, make_envs(spec, 50), n_episodes, 5, deterministic)
         margin = WITHIN_999 * exact.std_return / math.sqrt(n_episodes)
         assert exact.is_exact
         assert played.mean_return == pytest.approx(exact.mean_return, abs=margin + 1e-4)
@@ -323,7 +323,7 @@ def test_histories_that_an_agent_does_not_tell_apart_are_one(monkeypatch):
 def test_all_histories_say_what_many_episodes_say():
     memory = {**SHORT, "policy_kwargs": {"lstm_hidden_size": 4}}
     spec = spec_of("ppo_lstm", TIGER, {**memory, "env_kwargs": {"max_episode_steps": 5}})
-    env = make_evaluation_env(spec, 8)
+    env = make_envs(spec, 8)
     agent = agent_of("ppo_lstm", env, device="cpu", **memory).learn(32)
     exact = by_histories(spec, agent, world_of_memory(spec, agent))
     sampled = evaluate(agent, env, 400, seed=0)

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.compiled import engine
 from rl_yardstick.envs.wrappers import DiscretizeObservation
-from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
+from rl_yardstick.pipeline.environments import make_envs, make_training_env
 from rl_yardstick.pipeline.evaluation import sampled
 from rl_yardstick.pipeline.evaluation.sampled import (
     Evaluation,
@@ -107,7 +107,7 @@ def steady(monkeypatch, returns, length, n_timesteps):
 )
 def test_the_last_evaluation_ends_when_it_is_sure_or_dear(monkeypatch, returns, length, n_episodes):
     spec = steady(monkeypatch, returns, length, 3000)
-    evaluator = SampledEvaluator(spec, make_evaluation_env(spec, 1))
+    evaluator = SampledEvaluator(spec, make_envs(spec, 1))
     found = evaluator.at_the_end(agent_of("random", make_training_env(spec, None)))
     assert len(found.returns) == n_episodes
     assert evaluator.n_steps == n_episodes * length

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rl_yardstick.envs.argument_checks import check_whole_number
-from rl_yardstick.envs.drawing import Bar, Bars, BarsEnv
+from rl_yardstick.envs.drawing import Bar, Bars, ShownEnv
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
 # At most so many arms are shown, those of the contexts around the present one.
@@ -18,7 +18,7 @@ MAX_PULLS = 10**9
 MAX_ARMS = 10_000
 
 
-class Bandit(BarsEnv):
+class Bandit(ShownEnv):
     """Arms to pull, one a step, in the present context.
 
     A subclass defines the start of an episode in `_begin`, a pull in `step`, and the known means of
@@ -72,7 +72,7 @@ class Bandit(BarsEnv):
             self.render()
         return self.context, {}
 
-    def _bars(self) -> Bars:
+    def _picture(self) -> Bars:
         """A bar for each arm up to its observed mean, marked at its true mean."""
         means = self._sums / np.maximum(self._counts, 1)
         true, present = self._true_means(), int(self.context) if self.n_contexts else 0
@@ -117,9 +117,9 @@ class Bandit(BarsEnv):
         if self.render_mode == "human":
             self.render()
 
-    @abstractmethod
     def _true_means(self) -> Floats | None:
         """The mean reward of each arm, shape (n_contexts, n_arms); None if not known."""
+        return None
 
     @abstractmethod
     def _begin(self) -> None:

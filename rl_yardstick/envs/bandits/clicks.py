@@ -38,13 +38,8 @@ class ClickBandit(StochasticBandit):
         render_mode: str | None,
     ) -> None:
         n_contexts, n_arms = click_rates.shape
-        super().__init__(
-            n_arms,
-            spaces.Discrete(n_contexts),
-            pulls=pulls,
-            batch_size=batch_size,
-            render_mode=render_mode,
-        )
+        space = spaces.Discrete(n_contexts)
+        super().__init__(n_arms, space, pulls=pulls, batch_size=batch_size, render_mode=render_mode)
         self.means = click_rates
         self.context_probabilities = context_probabilities
         self.context_cumulative = np.cumsum(context_probabilities)

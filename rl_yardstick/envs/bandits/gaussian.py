@@ -79,12 +79,8 @@ class GaussianBandit(StochasticBandit):
         self.drift_std = check_number("drift_std", drift_std, 0)
         super().__init__(n_arms, spaces.Discrete(1), pulls=pulls, render_mode=render_mode)
         self.context = 0
-        self._means = [self.mean_loc] * n_arms if self.redraws else list(self.given_means or ())
-
-    @property
-    def redraws(self) -> bool:
-        """Whether each episode has means of its own."""
-        return self.given_means is None
+        self.redraws = self.given_means is None  # whether each episode has means of its own
+        self._means = list(self.given_means or [self.mean_loc] * n_arms)
 
     @property
     def means(self) -> Floats:

@@ -324,9 +324,6 @@ class ReplayBandit(Bandit):
             self._show_pull(before, arm, reward)
         return self.context, reward, False, self.pulls_done == self.pulls, info
 
-    def _true_means(self) -> None:
-        return None
-
     def _begin(self) -> None:
         self.matched_pulls = 0
         self.context = self._contexts[0]

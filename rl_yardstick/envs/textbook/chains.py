@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.envs.argument_checks import check_number, check_whole_number
 from rl_yardstick.envs.finite_env import MaskedFiniteEnv, summing_to_one
-from rl_yardstick.envs.grid import ChainEnv
+from rl_yardstick.envs.grid import MapEnv, in_rows
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 MOST_STATES, MOST_ACTIONS = 10_000, 1000
@@ -22,7 +22,7 @@ REVERSED, GOAL = 1, 3
 LEFT_END, B, A, RIGHT_END = range(4)
 
 
-class RandomWalkEnv(ChainEnv):
+class RandomWalkEnv(MapEnv):
     """A random walk to the left or to the right: the values of its states are to be estimated.
 
     ## Description
@@ -76,14 +76,12 @@ class RandomWalkEnv(ChainEnv):
         self.max_jump = check_whole_number("max_jump", max_jump, 1, MOST_STATES)
         self.left_reward = check_number("left_reward", left_reward)
         self.right_reward = check_number("right_reward", right_reward)
+        middle = "." * ((self.n_states + 1) // 2 - 1)
+        self.rows = in_rows(f"G{middle}S".ljust(self.n_states + 1, ".") + "G")
         super().__init__(self.n_states + 2, 1, render_mode)
 
     def transition_model(self) -> TransitionModel:
         return _walk(self.n_states, self.max_jump, self.left_reward, self.right_reward)
-
-    def letters(self) -> str:
-        middle = "." * ((self.n_states + 1) // 2 - 1)
-        return f"G{middle}S".ljust(self.n_states + 1, ".") + "G"
 
 
 @lru_cache(maxsize=4)
@@ -104,7 +102,7 @@ def _walk(n: int, max_jump: int, left: float, right: float) -> TransitionModel:
     )
 
 
-class RiverSwimEnv(ChainEnv):
+class RiverSwimEnv(MapEnv):
     """A swimmer goes against the current to a large reward, or with it to a small one.
 
     ## Description
@@ -152,13 +150,11 @@ class RiverSwimEnv(ChainEnv):
         self.n_states = check_whole_number("n_states", n_states, 2, MOST_STATES)
         self.left_reward = check_number("left_reward", left_reward)
         self.right_reward = check_number("right_reward", right_reward)
+        self.rows = in_rows("S".ljust(self.n_states - 1, ".") + "G")
         super().__init__(self.n_states, 2, render_mode)
 
     def transition_model(self) -> TransitionModel:
         return _river(self.n_states, self.left_reward, self.right_reward)
-
-    def letters(self) -> str:
-        return "S".ljust(self.n_states - 1, ".") + "G"
 
 
 @lru_cache(maxsize=4)
@@ -180,7 +176,7 @@ def _river(n: int, left_reward: float, right_reward: float) -> TransitionModel:
     )
 
 
-class ShortCorridorEnv(ChainEnv):
+class ShortCorridorEnv(MapEnv):
     """A corridor that only random actions can leave: repeating one action leads nowhere.
 
     ## Description
@@ -215,6 +211,7 @@ class ShortCorridorEnv(ChainEnv):
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
     """
 
+    rows = ("S..G",)
     action_names: ClassVar[tuple[str, ...]] = ("left", "right")
 
     def __init__(self, render_mode: str | None = None) -> None:
@@ -227,9 +224,6 @@ class ShortCorridorEnv(ChainEnv):
     def observation_of(self, states: Any) -> NDArray[Any]:
         """Always 0: all states look alike."""
         return np.zeros_like(states)
-
-    def letters(self) -> str:
-        return "S..G"
 
 
 @lru_cache(maxsize=1)
@@ -250,7 +244,7 @@ def _corridor() -> TransitionModel:
     )
 
 
-class MaximizationBiasEnv(ChainEnv, MaskedFiniteEnv):
+class MaximizationBiasEnv(MapEnv, MaskedFiniteEnv):
     """To the right no reward, to the left many actions that lose a little and often seem to win.
 
     ## Description
@@ -291,6 +285,7 @@ class MaximizationBiasEnv(ChainEnv, MaskedFiniteEnv):
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
     """
 
+    rows = ("G.SG",)
     action_names: ClassVar[tuple[str, ...]] = tuple(f"action {i}" for i in range(MOST_ACTIONS))
 
     def __init__(
@@ -312,9 +307,6 @@ class MaximizationBiasEnv(ChainEnv, MaskedFiniteEnv):
         masks = np.ones((4, self.n_actions), np.bool_)
         masks[A, 2:] = False
         return masks
-
-    def letters(self) -> str:
-        return "G.SG"
 
 
 @lru_cache(maxsize=4)

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from rl_yardstick.envs.argument_checks import check_choice, check_number, check_whole_number
-from rl_yardstick.envs.drawing import Bar, Bars, BarsEnv
+from rl_yardstick.envs.drawing import Bar, Bars
 from rl_yardstick.envs.finite_env import MaskedFiniteEnv, summing_to_one
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints, TransitionModel
 
@@ -29,7 +29,7 @@ VARIANTS = ("example", "exercise")
 N_SIDE = MOST_CARS + 1
 
 
-class GamblersProblemEnv(BarsEnv, MaskedFiniteEnv):
+class GamblersProblemEnv(MaskedFiniteEnv):
     """Stakes on a coin that comes up heads with a known probability: all at once, or a little?
 
     ## Description
@@ -88,7 +88,7 @@ class GamblersProblemEnv(BarsEnv, MaskedFiniteEnv):
     def masks_of_states(self) -> Bools:
         return allowed_stakes(self.goal)
 
-    def _bars(self) -> Bars:
+    def _picture(self) -> Bars:
         title = "start" if self.last_action is None else f"stake {self.last_action}"
         return Bars(title, [Bar("capital", self.s, f"{self.s} of {self.goal}")], 0, self.goal)
 
@@ -118,7 +118,7 @@ def _gamble(heads: float, goal: int, start: int | None) -> TransitionModel:
     )
 
 
-class JacksCarRentalEnv(BarsEnv, MaskedFiniteEnv):
+class JacksCarRentalEnv(MaskedFiniteEnv):
     """Cars are rented out at two places, and moved between them so that few customers go away.
 
     ## Description
@@ -203,7 +203,7 @@ class JacksCarRentalEnv(BarsEnv, MaskedFiniteEnv):
             evening.append(min(cars - rented + back, MOST_CARS))
         return evening[0] * N_SIDE + evening[1], earned, False
 
-    def _bars(self) -> Bars:
+    def _picture(self) -> Bars:
         moved = None if self.last_action is None else self.last_action - MOST_MOVED
         title = "start" if moved is None else f"moved {moved:+d}"
         names = "cars at the first place", "cars at the second place"

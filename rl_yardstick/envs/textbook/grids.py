@@ -111,12 +111,9 @@ class WindyGridworldEnv(MapEnv):
         self.moves = check_choice("moves", moves, tuple(STEPS))
         self.stochastic = check_flag("stochastic", stochastic)
         self.step_reward = check_number("step_reward", step_reward)
+        # The intended move of each action: rows down, columns to the right.
+        self.steps: tuple[tuple[int, int], ...] = STEPS[self.moves]
         super().__init__(N_ROWS * N_COLUMNS, len(self.steps), render_mode)
-
-    @property
-    def steps(self) -> tuple[tuple[int, int], ...]:
-        """The intended move of each action: rows down, columns to the right."""
-        return STEPS[self.moves]
 
     def transition_model(self) -> TransitionModel:
         return _windy(self.moves, self.stochastic, self.step_reward)
@@ -240,22 +237,13 @@ class DynaMazeEnv(GridWorld):
             "S": step,
             "G": Tile(step.reward + check_number("goal_reward", goal_reward), terminated=True),
         }
-        self.change_after_steps = change_after_steps
-        self.steps_done = 0
-        self._becomes = None if change_after_steps is None else last
+        self.change_after_steps, self.steps_done = change_after_steps, 0
+        self.is_stationary = change_after_steps is None
+        self._becomes = None if self.is_stationary else last
+        desc, edge = last if changed and self.is_stationary else first, self._tiles["#"]
         super().__init__(
-            last if changed and change_after_steps is None else first,
-            self._tiles,
-            edge=Tile(step.reward, blocked=True),
-            slip=slip,
-            random_start=random_start,
-            render_mode=render_mode,
+            desc, self._tiles, edge, slip=slip, random_start=random_start, render_mode=render_mode
         )
-
-    @property
-    def is_stationary(self) -> bool:
-        """Whether the maze stays as it is."""
-        return self.change_after_steps is None
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         result = super().step(action)
@@ -271,6 +259,7 @@ class DynaMazeEnv(GridWorld):
         self._becomes = None
         passable = [letter for letter, tile in self._tiles.items() if not tile.blocked]
         self.map = GridMap.read(rows, self._tiles, passable)
+        self.rows = self.map.rows
         edge, slip = self.dynamics.edge, 1 - self.dynamics.outcome_prob[0]
         self.dynamics = GridDynamics(self.map, self._tiles, edge, slip)
         for worked_out in ("P", "initial_state_distrib", "_starts"):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
@@ -55,6 +55,7 @@ class KnownWorld:
     horizon: int  # the time limit, for visit counts
     masks: Bools | None  # action masks, shape (S, A), for agents that use them
     is_limited: bool = True  # whether ``horizon`` limits training; else only evaluations
+    _values: dict[float, OfLastPolicy[PolicyValues]] = field(default_factory=dict)  # by discount
 
     @cached_property
     def visits(self) -> OfLastPolicy[Floats]:
@@ -67,10 +68,6 @@ class KnownWorld:
             return np.asarray(visits / visits.sum())
 
         return OfLastPolicy(shares)
-
-    @cached_property
-    def _values(self) -> dict[float, OfLastPolicy[PolicyValues]]:
-        return {}
 
     def values(self, policy: Floats, discount: float) -> PolicyValues:
         """The exact values of a policy (S, A)."""
@@ -123,12 +120,8 @@ def known_world(spec: TrainSpec, agent: BaseAlgorithm) -> KnownWorld | str:
     return world
 
 
-def recorder_of(
-    path: Path, spec: TrainSpec, agent: BaseAlgorithm, *, is_evaluated: bool
-) -> CriticRecorder | str:
+def recorder_of(path: Path, spec: TrainSpec, agent: BaseAlgorithm) -> CriticRecorder | str:
     """The recorder of a training; or a line on why there is none."""
-    if not is_evaluated:
-        return "there are no evaluations during this training"
     world = known_world(spec, agent)
     if isinstance(world, str):
         return world

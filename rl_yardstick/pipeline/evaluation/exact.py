@@ -22,12 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl_yardstick import mdp
+from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs import known_models
 from rl_yardstick.envs.layout import GridLayout, grid_layout
 from rl_yardstick.mdp.beliefs import Bracket, memory_optimum
 from rl_yardstick.mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats
-from rl_yardstick.pipeline.environments import evaluation_kwargs, make_single_env
+from rl_yardstick.pipeline.environments import kwargs_of, make_single_env
 from rl_yardstick.pipeline.evaluation.yardstick import (
     FAILED,
     Evaluation,
@@ -243,10 +244,8 @@ class ExactEvaluator:
         share = self.out_of_time(policy)
         if share < 0.5:
             found = mdp.policy_return(model, policy, horizon, success=self.success)
-            end, rate = (
-                f"{1 - share:.0%} of its episodes end before the time limit",
-                found.success_rate,
-            )
+            end = f"{1 - share:.0%} of its episodes end before the time limit"
+            rate = found.success_rate
             return end if rate is None else f"{end}, {rate:.1%} of all with success"
         late = mdp.last_visits(model, policy, horizon, min(LAST_STEPS, max(horizon // 2, 1)))
         order = np.argsort(-late, kind="stable")
@@ -285,23 +284,21 @@ _kept: dict[str, ExactEvaluator] = {}
 
 def evaluator_of_single(spec: TrainSpec) -> ExactEvaluator | None:
     """Like `exact_evaluator`, but ignores VecEnv wrappers; cached for later runs of the process."""
-    if spec.env_wrapper or spec.gym_packages:  # of which the key tells too little
-        return _evaluator(spec)
-    masks = spec.algorithm.get("mask_actions", False)
-    with closing(make_single_env(spec)) as env:
-        seen = env.observation_space  # some agents number the members of a space
-    key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks, seen))
-    found = _kept.pop(key, None) or _evaluator(spec)
-    if found is not None and found.model.n_states <= MOST_STATES_KEPT:
+    known, agent, masks = gym.registry[spec.env_id], ALGORITHMS.get(spec.algo), "mask_actions"
+    # Some agents number the members of spaces.
+    numbered = None if agent is None else (agent.numbers_spaces, agent.observations, agent.actions)
+    key = repr((known, sorted(kwargs_of(spec).items()), spec.algorithm.get(masks), numbered))
+    # Of the user's own code, the key tells too little.
+    is_kept = isinstance(known.entry_point, str) and not (spec.env_wrapper or spec.gym_packages)
+    found = _kept.pop(key, None) if is_kept else None
+    if found is None:
+        with closing(make_single_env(spec)) as env:
+            found = evaluator_in(env)
+    if found is not None and is_kept and found.model.n_states <= MOST_STATES_KEPT:
         _kept[key] = found
         if len(_kept) > MOST_KEPT:
             del _kept[next(iter(_kept))]
     return found
-
-
-def _evaluator(spec: TrainSpec) -> ExactEvaluator | None:
-    with closing(make_single_env(spec)) as env:
-        return evaluator_in(env)
 
 
 def evaluator_in(env: gym.Env[Any, Any]) -> ExactEvaluator | None:

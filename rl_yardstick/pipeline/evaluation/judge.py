@@ -25,14 +25,14 @@ from rl_yardstick.agents.plain import PlainAgent
 from rl_yardstick.agents.planning import RandomAgent
 from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Ints
-from rl_yardstick.pipeline.environments import make_evaluation_env, make_single_env, remembers
+from rl_yardstick.pipeline.environments import make_envs, make_single_env, remembers
 from rl_yardstick.pipeline.evaluation.exact import (
     ExactEvaluator,
     evaluator_of_single,
     exact_evaluator,
     model_refusal,
 )
-from rl_yardstick.pipeline.evaluation.sampled import SampledEvaluator, n_environments
+from rl_yardstick.pipeline.evaluation.sampled import STAGES, SampledEvaluator
 from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, Yardstick
 from rl_yardstick.pipeline.spec import TrainSpec
 
@@ -59,8 +59,8 @@ class Judge:
         world = None if exact is not None else world_of_memory(spec, agent)
         is_plain = isinstance(agent, PlainAgent)  # and may remember
         if exact is None and not is_plain and policies.is_of_library(agent.predict.__module__):
-            n_envs = n_environments(spec.n_eval_envs, spec.eval_episodes)
-        self.exact, self.env = exact, make_evaluation_env(spec, n_envs)
+            n_envs = min(spec.n_eval_envs, spec.eval_episodes or STAGES[0])  # one for each episode
+        self.exact, self.env = exact, make_envs(spec, n_envs)
         self.evaluator: Any = exact
         if world is not None:
             note = "evaluations are exact, over all histories of observations, while those are few"
@@ -105,18 +105,10 @@ class HistoryEvaluator(SampledEvaluator):
         may_sample = super().can_afford(model, n_episodes)
         return self._was_exact or may_sample
 
-    def __call__(self, model: BaseAlgorithm) -> Evaluation:
-        """Evaluate during training."""
-        return self._exact(model) or super().__call__(model)
-
-    def at_the_end(self, model: BaseAlgorithm) -> Evaluation:
-        """Evaluate at the end of training."""
-        return self._exact(model) or super().at_the_end(model)
-
-    def _exact(self, model: BaseAlgorithm) -> Evaluation | None:
+    def _evaluate(self, model: BaseAlgorithm, *limits: Any) -> Evaluation:
         found = by_histories(self.spec, model, self.world)
         self._was_exact = found is not None
-        return found
+        return found or super()._evaluate(model, *limits)
 
 
 class _Memory:

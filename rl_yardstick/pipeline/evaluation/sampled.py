@@ -231,11 +231,6 @@ def is_sure(evaluation: Evaluation, precision: float) -> bool:
     return n_episodes >= LEAST_SURE and error <= precision * abs(evaluation.mean_return)
 
 
-def n_environments(n_eval_envs: int, n_episodes: int | None) -> int:
-    """The number of parallel evaluation environments: at most one for each episode."""
-    return min(n_eval_envs, STAGES[0] if n_episodes is None else n_episodes)
-
-
 def evaluate_compiled(
     model: BaseAlgorithm, copy: Any, n_episodes: int, seed: int | None
 ) -> Evaluation:

@@ -25,11 +25,6 @@ def rounding(optimum: float) -> float:
     return ROUNDING * max(1.0, abs(optimum))
 
 
-def bracket_mark(is_proven: bool) -> str:
-    """The remark behind figures of a bracketed optimum."""
-    return "(bracketed)" if is_proven else "(bracketed; the upper end is not proven)"
-
-
 @dataclass(frozen=True)
 class HiddenState:
     """The optima of other kinds of agents, if observations hide the state."""
