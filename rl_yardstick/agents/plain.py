@@ -60,11 +60,9 @@ class PlainAgent(OnlineAlgorithm):
             raise ValueError("it learns from one environment at a time: n_envs must be 1")
 
     def _setup_model(self) -> None:
-        self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
+        super()._setup_model()
         if self.seed is not None:
             set_random_seed(self.seed)  # the global generators, which the user's class may use
-        self.policy = PlainPolicy(self.observation_space, self.action_space)
         self.policy.owner = self
         self.agent = self._made()
         _ = self.judged, self._state()  # what fails, fails at the start

@@ -65,11 +65,6 @@ class ReferenceAgent(OnlineAlgorithm):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
 
-    def _setup_model(self) -> None:
-        self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
-        self.policy = self.policy_class(self.observation_space, self.action_space)
-
     def _choose_actions(self) -> NDArray[Any]:
         assert self._last_obs is not None
         return super().predict(self._last_obs)[0]
@@ -107,11 +102,6 @@ class ActionTablePolicy(TablePolicy):
         shape = (1, int(self.observation_space.n))  # type: ignore[attr-defined]
         self.register_buffer("actions", th.zeros(shape, dtype=th.int64))
         self.register_buffer("horizon", th.tensor(1))
-
-    def set_actions(self, actions: NDArray[np.integer[Any]], horizon: int) -> None:
-        """Set the plan: actions of shape (m, S) and the number of steps of an episode."""
-        self.actions = th.from_numpy(actions.astype(np.int64))
-        self.horizon = th.tensor(horizon)
 
     @property
     def is_stationary(self) -> bool:
@@ -177,9 +167,7 @@ class PlanningAgent(OnlineAlgorithm):
     def _setup_model(self) -> None:
         if not 0 <= self.gamma <= 1:
             raise ValueError(f"gamma must lie between 0 and 1, not {self.gamma}")
-        self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
-        self.policy = self.policy_class(self.observation_space, self.action_space)  # type: ignore[assignment]
+        super()._setup_model()
 
     def _begin_episodes(self) -> None:
         self._steps = np.zeros(self.n_envs, dtype=np.int64)
@@ -211,7 +199,7 @@ class PlanningAgent(OnlineAlgorithm):
         # E.g. in Blackjack a natural looks like any other 21.
         if (actions[:, observations] != by_state)[:, model.reachable].any():
             raise ValueError(f"{name} needs observations that tell the states apart")
-        self.policy.set_actions(actions, horizon)
+        self.policy.actions, self.policy.horizon = th.from_numpy(actions), th.tensor(horizon)
 
     def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
         """The plan under a time limit, among the actions of ``mask``, bool of shape (S, A)."""

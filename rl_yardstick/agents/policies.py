@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -49,13 +48,8 @@ def has_memory(agent: BaseAlgorithm) -> bool:
 
 def takes_masks(model: Any) -> bool:
     """Whether `predict` takes ``action_masks``, and the agent uses them."""
-    predict = getattr(model.predict, "__func__", model.predict)
-    return "action_masks" in _parameters(predict) and bool(getattr(model, "mask_actions", True))
-
-
-@lru_cache(maxsize=64)
-def _parameters(predict: Callable[..., Any]) -> frozenset[str]:
-    return frozenset(inspect.signature(predict).parameters)
+    takes = "action_masks" in inspect.signature(model.predict).parameters
+    return takes and bool(getattr(model, "mask_actions", True))
 
 
 # The most input numbers of a network per call, and in total; above, playing episodes is faster than

@@ -28,10 +28,9 @@ class ARS(sb3_contrib.ARS):
     """
 
     _last_dones: Any = None
-    # Its rollouts begin in the middle of an update, after its directions have been drawn.
-    tells_safe_moments = True
 
     def _do_one_update(self, callback: BaseCallback, async_eval: Any) -> None:
+        # Rollouts begin in the middle of an update, after its directions have been drawn.
         for member in members(callback):
             if isinstance(member, BlockCallback):
                 member.at_safe_moment()

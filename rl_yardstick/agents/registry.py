@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import importlib.util
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -305,51 +303,17 @@ BY_VALUE: dict[str, type] = {}  # classes that `name_of` has registered
 
 
 def register(name: str, entry_point: str, **fields: Any) -> None:
-    """Add an agent of your own to the registry, so that the commands find it.
+    """Add an agent of your own to the registry under a short name; nothing is imported.
 
-    Nothing is imported: call it when your module is imported, before any slow imports. A second
-    call with the same arguments has no effect.
-
-    Args:
-        name: the value of ``--algo``.
-        entry_point: the class, a subclass of `BaseAlgorithm` or a plain one with ``act`` and
-            ``learn``, as ``"module:Class"``.
-        fields: further attributes of `AlgorithmEntry`, each with its default: ``summary`` (the
-            class's name), ``observations`` and ``actions`` (any space), ``observation_shape``,
-            ``for_bandits``, ``needs_masks``, ``has_memory``, ``package``, ``extra`` and
-            ``engines``, which is read from the class by default.
-
-    Raises:
-        ValueError: if the name is taken, or a field does not exist or has an invalid value.
+    ``entry_point`` is its class as ``"module:Class"``, ``fields`` are attributes of
+    `AlgorithmEntry`. Raises ValueError if the name is that of another class.
     """
-    if not re.fullmatch(r"[A-Za-z0-9]\w*([.-]\w+)*", name, re.ASCII):
-        raise ValueError(f"the name of an agent holds letters, digits and _, not {name!r}")
-    if not re.fullmatch(r"[\w.]+:\w+", str(entry_point)):
-        raise ValueError(f"{name}: the class is named as 'module:Class', not {entry_point!r}")
-    unknown = set(fields) - {key.name for key in dataclasses.fields(AlgorithmEntry)}
-    if unknown:
-        raise ValueError(f"{name}: an entry has no {', '.join(sorted(unknown))}")
-    for role in ("observations", "actions"):
-        fields[role] = _space_names(name, role, fields.get(role, ()))
-    fields.setdefault("summary", entry_point.rpartition(":")[2])
-    entry = AlgorithmEntry(entry_point, **fields)
-    taken = next((known for known in ALGORITHMS if known.lower() == name.lower()), None)
-    if taken is not None and (taken, ALGORITHMS[taken]) != (name, entry):
-        raise ValueError(
-            f"there is an agent {taken} already ({ALGORITHMS[taken].entry_point}): "
-            f"register {entry_point} under another name"
-        )
-    ALGORITHMS[name] = entry
-
-
-def _space_names(name: str, role: str, given: Any) -> tuple[str, ...]:
-    """The names of spaces as an entry holds them."""
-    names = tuple(given) if isinstance(given, list | tuple) else (given,)
-    for space in names:
-        kind = getattr(spaces, space, None) if isinstance(space, str) else None
-        if not (isinstance(kind, type) and issubclass(kind, spaces.Space)):
-            raise ValueError(f"{name}: {role} are names of Gymnasium's spaces, not {space!r}")
-    return names
+    for role in {"observations", "actions"} & fields.keys():
+        names = fields[role]
+        fields[role] = (names,) if isinstance(names, str) else tuple(names)
+    entry = AlgorithmEntry(entry_point, **{"summary": entry_point.rpartition(":")[2], **fields})
+    if ALGORITHMS.setdefault(name, entry) != entry:
+        raise ValueError(f"there is an agent {name} already: give {entry_point} another name")
 
 
 def add_class(name: str, cls: Any) -> None:

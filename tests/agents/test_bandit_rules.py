@@ -86,7 +86,7 @@ INDICES = [  # after 6 pulls: UCB1 takes 2 ln 6, Sutton and Barto the logarithm 
 def test_ucb_index(kwargs, logarithm, width):
     model = agent("ucb", **kwargs)
     for mean, count in ((0.5, 4), (1.0, 1)):
-        index = rules.ucb_index(mean, count, 6, model.width, model.is_textbook)
+        index = rules.ucb_index(model.compiled_agent(model.rng), mean, count, 6)
         assert index == pytest.approx(mean + width * math.sqrt(logarithm / count), rel=1e-15)
 
 
@@ -100,9 +100,14 @@ def test_arms_not_tried_come_first(name):
     assert model.predict(0, deterministic=True)[0] == 1
 
 
+def kl_ucb_index(mean, count, pulls, c=0.0):
+    model = agent("kl_ucb", c=c)
+    return rules.kl_ucb_index(model.compiled_agent(model.rng), mean, count, pulls)
+
+
 @given(st.floats(0.0, 0.999), st.integers(1, 10_000), st.integers(2, 10**6))
 def test_kl_ucb_index_solves_its_equation(mean, count, pulls):
-    index = rules.kl_ucb_index(mean, count, pulls, 0.0)
+    index = kl_ucb_index(mean, count, pulls)
     assert mean <= index < 1.0
     budget = math.log(pulls) / count
     if index < 1 - 1e-9:
@@ -117,7 +122,7 @@ def test_kl_ucb_where_it_has_a_closed_form():
         assert rules.kl_upper_bound(0.0, budget) == pytest.approx(1 - math.exp(-budget), rel=1e-12)
         assert rules.kl_upper_bound(1.0, budget) == 1.0
     assert rules.kl_upper_bound(0.3, 0.0) == 0.3
-    with_c = rules.kl_ucb_index(0.3, 10, 100, 3.0)
+    with_c = kl_ucb_index(0.3, 10, 100, c=3.0)
     budget = (math.log(100) + 3 * math.log(math.log(100))) / 10
     assert with_c == pytest.approx(rules.kl_upper_bound(0.3, budget), rel=1e-15)
 

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from rl_yardstick.agents.bandits.choosing import (
@@ -194,14 +194,12 @@ class BanditAlgorithm(LearningAlgorithm):
     def _learn(self, pull: Pull) -> None:
         """Learn from one pull."""
 
-    def _setup_learn(
-        self, total_timesteps: int, callback: MaybeCallback = None, *args: Any, **kwargs: Any
-    ) -> tuple[int, BaseCallback]:
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         assert self.env is not None
         self.check_kinds(self.env)
         if self.mask_actions:
             self._check_masks()
-        return super()._setup_learn(total_timesteps, callback, *args, **kwargs)
+        return super()._setup_learn(*args, **kwargs)
 
     def _begin_episodes(self) -> None:
         self._pending = [[] for _ in range(self.n_envs)]

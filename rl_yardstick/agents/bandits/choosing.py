@@ -17,7 +17,7 @@ from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 # Agents that keep a score for each arm in each context: choosing an arm, learning from its reward.
 #
 # Compiled functions, shared by the interpreted and the compiled loop. An algorithm defines
-# `choose_arm` and `learn_from_pull`, and `choice_probability` if its update needs it.
+# `choose_arm` and `learn_from_reward`, and `choice_probability` if its update needs it.
 
 # A pull and its reward, kept until the feedback is due.
 PULL = np.dtype(
@@ -90,16 +90,6 @@ def choose_allowed(
     raise CompiledOnlyError
 
 
-@by_type_or_this
-def learn_from_pull(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """Learn from a record of type `PULL`, after its reward has been added to the tables."""
-
-
-@by_type_or_this
-def before_counting(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """The part of learning that comes before the reward is added to the tables."""
-
-
 @inlined
 def total_count(tables: Any, row: int) -> int:
     """Number of rewards seen in a context, including those of masked arms."""
@@ -126,12 +116,10 @@ def row_of_scores(agent: ScoreAgent, env: Any) -> int:
 
 
 @inlined
-def count_and_learn(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """Add a reward to the tables, and learn from it."""
-    before_counting(agent, pull, progress)
-    agent.tables.counts[pull.row, pull.arm] += 1
-    agent.tables.sums[pull.row, pull.arm] += pull.reward
-    learn_from_pull(agent, pull, progress)
+def count_reward(tables: ScoreTables, pull: Any) -> None:
+    """Add the reward of a record of type `PULL` to the tables."""
+    tables.counts[pull.row, pull.arm] += 1
+    tables.sums[pull.row, pull.arm] += pull.reward
 
 
 @inlined
@@ -247,7 +235,7 @@ def learn_one(agent: ScoreAgent, pull: Any, mask: Bools, room: AllowedRoom, prog
             place = k
     pull.row = 0
     pull.arm = place
-    count_and_learn(smaller, pull, progress)
+    learn_from_reward(smaller, pull, progress)
     for k in range(n):
         arm = room.arms[k]
         tables.scores[row, arm] = room.scores[0, k]

@@ -10,8 +10,14 @@ from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import Schedule
 
 from rl_yardstick.agents.bandits.algorithm import ANY, BINARY, UNIT
-from rl_yardstick.agents.bandits.choosing import ScoreAgent, ScoreTables, mean_reward, total_count
-from rl_yardstick.agents.bandits.tables import TableBandit, mean_rewards
+from rl_yardstick.agents.bandits.choosing import (
+    ScoreAgent,
+    ScoreTables,
+    count_reward,
+    mean_reward,
+    total_count,
+)
+from rl_yardstick.agents.bandits.tables import TableBandit
 from rl_yardstick.agents.common.exploration import (
     BOLTZMANN,
     action_probabilities,
@@ -53,6 +59,7 @@ def highest_bound(agent: ScoreAgent, row: int, progress: Any) -> int:
 def average_rewards(agent: ScoreAgent, pull: Any, progress: Any) -> None:
     """The score is the mean reward."""
     tables = agent.tables
+    count_reward(tables, pull)
     total, count = tables.sums[pull.row, pull.arm], tables.counts[pull.row, pull.arm]
     tables.scores[pull.row, pull.arm] = total / count
 
@@ -61,29 +68,24 @@ class UpperBoundBandit(TableBandit):
     """Pulls each arm once, then the one of the highest bound; subclasses set `upper_bound`."""
 
     choose_arm = highest_bound
-    learn_from_pull = average_rewards
+    learn_from_reward = average_rewards
     initial_score = -math.inf  # below that of any arm that was tried
 
 
 # Upper confidence bounds.
 
 Variant = Literal["ucb1", "sutton_barto"]
+SUTTON_BARTO = 1
 
 
 @inlined
-def ucb_index(mean: float, count: int, pulls: int, width: float, textbook: bool) -> float:
+def ucb_index(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float:
     """Mean plus width sqrt(2 ln t / n) after t pulls, or width sqrt(ln t / n) at the t-th pull.
 
     The first is UCB1 (Auer et al., 2002), the second Sutton and Barto's, section 2.7.
     """
-    factor, offset = (1.0, 1.0) if textbook else (2.0, 0.0)
-    return mean + width * math.sqrt(factor * math.log(pulls + offset) / count)
-
-
-@inlined
-def ucb_bound(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float:
-    """`ucb_index` with the agent's settings."""
-    return ucb_index(mean, count, pulls, agent.settings.width, agent.settings.is_textbook)
+    factor, offset = (1.0, 1.0) if agent.settings.variant == SUTTON_BARTO else (2.0, 0.0)
+    return float(mean + agent.settings.width * math.sqrt(factor * math.log(pulls + offset) / count))
 
 
 class UCB(UpperBoundBandit):
@@ -97,9 +99,9 @@ class UCB(UpperBoundBandit):
         c: degree of exploration; by default 1 for UCB1 and 2 for Sutton and Barto's.
     """
 
-    parameters = {"width": np.float64, "is_textbook": np.bool_}  # noqa: RUF012
+    parameters = {"width": np.float64, "variant": np.int64}  # noqa: RUF012
     ranges = {"c": NOT_NEGATIVE}  # noqa: RUF012
-    upper_bound = ucb_bound
+    upper_bound = ucb_index
 
     hidden_arguments = ("learning_rate",)
 
@@ -111,14 +113,9 @@ class UCB(UpperBoundBandit):
         super().__init__(*args, **kwargs)
 
     @property
-    def is_textbook(self) -> bool:
-        """Whether the bound is Sutton and Barto's."""
-        return self.variant == "sutton_barto"
-
-    @property
     def width(self) -> float:
         """The degree of exploration ``c``, or its default."""
-        default = 2.0 if self.is_textbook else 1.0
+        default = 2.0 if self.variant == "sutton_barto" else 1.0
         return default if self.c is None else self.c
 
 
@@ -160,19 +157,13 @@ def kl_upper_bound(p: float, budget: float) -> float:
 
 
 @inlined
-def kl_ucb_index(mean: float, count: int, pulls: int, c: float) -> float:
+def kl_ucb_index(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float:
     """The highest q with count * kl(mean, q) <= ln(pulls) + c ln(ln(pulls)).
 
     Source: Garivier and Cappe, 2011.
     """
-    log_pulls = math.log(pulls)
+    log_pulls, c = math.log(pulls), agent.settings.c
     return kl_upper_bound(mean, (log_pulls + c * math.log(max(log_pulls, 1.0))) / count)
-
-
-@inlined
-def kl_ucb_bound(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float:
-    """`kl_ucb_index` with the agent's settings."""
-    return kl_ucb_index(mean, count, pulls, agent.settings.c)
 
 
 class KLUCB(UpperBoundBandit):
@@ -187,7 +178,7 @@ class KLUCB(UpperBoundBandit):
     parameters = {"c": np.float64}  # noqa: RUF012
     ranges = {"c": NOT_NEGATIVE}  # noqa: RUF012
     rewards_known = UNIT
-    upper_bound = kl_ucb_bound
+    upper_bound = kl_ucb_index
 
     hidden_arguments = ("learning_rate",)
 
@@ -200,6 +191,7 @@ class KLUCB(UpperBoundBandit):
 
 
 Likelihood = Literal["bernoulli", "gaussian"]
+GAUSSIAN = 1
 
 
 @inlined
@@ -208,7 +200,7 @@ def sample_posteriors(agent: ScoreAgent, row: int, progress: Any) -> int:
     settings, tables, rng = agent.settings, agent.tables, generator_of(agent.rng)
     for arm in range(len(agent.arms)):
         count = tables.counts[row, arm]
-        if settings.is_gaussian:
+        if settings.likelihood == GAUSSIAN:
             precision = settings.prior_precision + count * settings.reward_precision
             deviation = 1.0 / math.sqrt(precision)
             agent.arms[arm] = tables.scores[row, arm] + deviation * rng.standard_normal()
@@ -224,8 +216,9 @@ def sample_posteriors(agent: ScoreAgent, row: int, progress: Any) -> int:
 def update_mean(agent: ScoreAgent, pull: Any, progress: Any) -> None:
     """The score is the mean of the posterior."""
     settings, tables = agent.settings, agent.tables
+    count_reward(tables, pull)
     total, count = tables.sums[pull.row, pull.arm], tables.counts[pull.row, pull.arm]
-    if settings.is_gaussian:
+    if settings.likelihood == GAUSSIAN:
         weighted = (
             settings.prior_precision * settings.prior_mean + settings.reward_precision * total
         )
@@ -250,7 +243,7 @@ class Thompson(TableBandit):
     """
 
     parameters = {  # noqa: RUF012
-        "is_gaussian": np.bool_,
+        "likelihood": np.int64,
         "prior_successes": np.float64,
         "prior_failures": np.float64,
         "prior_mean": np.float64,
@@ -262,7 +255,7 @@ class Thompson(TableBandit):
         **dict.fromkeys(("prior_successes", "prior_failures", "prior_std", "reward_std"), POSITIVE),
     }
     choose_arm = sample_posteriors
-    learn_from_pull = update_mean
+    learn_from_reward = update_mean
 
     hidden_arguments = ("learning_rate",)
 
@@ -286,19 +279,14 @@ class Thompson(TableBandit):
         super().__init__(*args, **kwargs)
 
     @property
-    def is_gaussian(self) -> bool:
-        """Whether rewards are assumed to have normal noise."""
-        return self.likelihood == "gaussian"
-
-    @property
     def rewards_known(self) -> str:  # type: ignore[override]
         """0 or 1 for a Bernoulli likelihood, any reward for a normal one."""
-        return ANY if self.is_gaussian else BINARY
+        return ANY if self.likelihood == "gaussian" else BINARY
 
     @property
     def initial_score(self) -> float:  # type: ignore[override]
         """The mean of the prior."""
-        if self.is_gaussian:
+        if self.likelihood == "gaussian":
             return self.prior_mean
         return self.prior_successes / (self.prior_successes + self.prior_failures)
 
@@ -323,7 +311,7 @@ class Thompson(TableBandit):
             one, shape (..., 2).
         """
         sums, counts = tables.sums, tables.counts
-        if not self.is_gaussian:
+        if self.likelihood != "gaussian":
             failures = self.prior_failures + counts - sums
             return np.stack([self.prior_successes + sums, failures], axis=-1)
         precision: Any = self.prior_precision + self.reward_precision * counts
@@ -347,7 +335,9 @@ class PreferenceBandit(TableBandit):
 
     def estimates(self, tables: ScoreTables) -> Floats:
         """Average rewards, nan where there is none, shapes (..., contexts, arms)."""
-        return mean_rewards(tables.sums, tables.counts)
+        means = np.full(tables.sums.shape, np.nan)
+        np.divide(tables.sums, tables.counts, out=means, where=tables.counts > 0)
+        return means
 
     def action_probabilities(self, observations: NDArray[Any]) -> Floats:
         """The probabilities of arms now at each of n observations, shape (n, arms)."""
@@ -383,6 +373,7 @@ def gradient_step(agent: ScoreAgent, pull: Any, progress: Any) -> None:
         chosen = 1.0 if arm == pull.arm else 0.0
         advantage = progress.learning_rate * (pull.reward - baseline)
         tables.scores[pull.row, arm] += advantage * (chosen - agent.arms[arm])
+    count_reward(tables, pull)
 
 
 class GradientBandit(PreferenceBandit):
@@ -396,7 +387,7 @@ class GradientBandit(PreferenceBandit):
 
     parameters = {"baseline": np.bool_}  # noqa: RUF012
     choose_arm = choose_by_preference
-    before_counting = gradient_step
+    learn_from_reward = gradient_step
 
     def __init__(
         self,
@@ -439,6 +430,7 @@ def probability_of(agent: ScoreAgent, row: int, arm: int) -> float:
 @inlined
 def raise_weight(agent: ScoreAgent, pull: Any, progress: Any) -> None:
     """Add the importance-weighted reward (reward / probability) to the arm's log-weight."""
+    count_reward(agent.tables, pull)
     share = agent.settings.mixing * pull.reward
     agent.tables.scores[pull.row, pull.arm] += share / (pull.probability * len(agent.arms))
 
@@ -457,7 +449,7 @@ class Exp3(PreferenceBandit):
     rewards_known = UNIT
     choose_arm = draw_by_weight
     choice_probability = probability_of
-    learn_from_pull = raise_weight
+    learn_from_reward = raise_weight
 
     hidden_arguments = ("learning_rate",)
 

@@ -20,7 +20,7 @@ from rl_yardstick.agents.bandits.choosing import (
     ScoreTables,
     allowed_room,
     choose_by_allowed_scores,
-    count_and_learn,
+    count_reward,
     learn_one,
     row_of_scores,
 )
@@ -66,13 +66,6 @@ class BanditPolicy(ArmPolicy):
         return scores
 
 
-def mean_rewards(sums: Floats, counts: Ints) -> Floats:
-    """Sums over counts, nan where the count is 0; all of one shape."""
-    means = np.full(sums.shape, np.nan)
-    np.divide(sums, counts, out=means, where=counts > 0)
-    return means
-
-
 # The base of agents that keep a score for each arm in each context.
 
 
@@ -91,9 +84,8 @@ class TableBandit(RuleBandit):
     parameters = {"ignore_context": np.bool_}  # noqa: RUF012
     initial_score: float = 0.0  # of every arm
 
-    # Called by the training loops; each algorithm defines `choose_arm` and `learn_from_pull`.
+    # Called by the training loops; an algorithm adds `choose_arm` and `learn_from_reward`.
     context_row = row_of_scores
-    learn_from_reward = count_and_learn
     choose_allowed = choose_by_allowed_scores
 
     def __init__(
@@ -167,6 +159,7 @@ def choose_by_value(agent: ScoreAgent, row: int, progress: Any) -> int:
 @inlined
 def move_value(agent: ScoreAgent, pull: Any, progress: Any) -> None:
     """Move the arm's value towards the reward."""
+    count_reward(agent.tables, pull)
     count = agent.tables.counts[pull.row, pull.arm]
     size = step_size(progress.learning_rate, agent.settings.averages_samples, count)
     error = pull.reward - agent.tables.scores[pull.row, pull.arm]
@@ -182,7 +175,7 @@ class ValueBandit(TableBandit):
     """
 
     choose_arm = choose_by_value
-    learn_from_pull = move_value
+    learn_from_reward = move_value
 
     def __init__(
         self,

@@ -46,8 +46,7 @@ class Transitions:
 class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
     """Acts and learns one step at a time, with its own random generators.
 
-    Subclasses define `_setup_model`, which calls ``set_random_seed``, and `_choose_actions`.
-    Subclasses that learn override `_learn_from`.
+    Subclasses define `_choose_actions`; those that learn override `_learn_from`.
 
     Args:
         policy: name of the policy.
@@ -112,6 +111,12 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
         if cls.observed and isinstance(env, gym.Env):
             env = numbered(env, cls.observed, ("Discrete",))
         return JsonAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+
+    def _setup_model(self) -> None:
+        """Seed the generators, and make the policy."""
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self.policy_class(self.observation_space, self.action_space)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """As the library; `predict` then uses the spaces of this environment."""

@@ -10,7 +10,6 @@ Sutton and Barto (2nd edition): epsilon-greedy section 2.2, softmax section 2.8.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -65,16 +64,6 @@ def greedy_action(values: Floats, uniform: float) -> int:
                 return action
             skip -= 1
     return best_action
-
-
-@inlined
-def first_best(values: Any) -> int:
-    """The first of the largest values."""
-    best = 0
-    for k in range(1, len(values)):
-        if values[k] > values[best]:
-            best = k
-    return best
 
 
 @inlined

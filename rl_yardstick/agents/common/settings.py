@@ -123,18 +123,18 @@ def check_settings(agent: Any) -> None:
     for cls in type(agent).__mro__:
         ranges = {**vars(cls).get("ranges", {}), **ranges}
     for name, parameter in type(agent).__signature__.parameters.items():
-        value, words = getattr(agent, name, None), _words(parameter.annotation)
+        value, known = getattr(agent, name, None), words(parameter.annotation)
         if not isinstance(value, str):
             if name in ranges:
                 ranges[name].check(name, value)
-        elif value not in words and name in ranges:
-            last = f", a schedule or {words[0]!r}" if words else " or a schedule"
+        elif value not in known and name in ranges:
+            last = f", a schedule or {known[0]!r}" if known else " or a schedule"
             raise ValueError(f"{name} must be a number{last}, not {value!r}")
-        elif value not in words and words:
-            raise ValueError(f"{name} must be one of {', '.join(words)}, not {value!r}")
+        elif value not in known and known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, not {value!r}")
 
 
-def _words(annotation: Any) -> list[str]:
+def words(annotation: Any) -> list[str]:
     """The words that an annotation allows."""
     kinds = (annotation, *get_args(annotation))
     return [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]

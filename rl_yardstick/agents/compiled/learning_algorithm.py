@@ -22,6 +22,7 @@ from rl_yardstick.agents.common.settings import (
     Range,
     TieBreaking,
     check_settings,
+    words,
 )
 from rl_yardstick.agents.compiled.loop import settings_dtype
 from rl_yardstick.agents.compiled.worlds import PROGRESS, NotCompilable
@@ -174,10 +175,13 @@ class LearningAlgorithm(OnlineAlgorithm):
         return {**self.__dict__, **dict.fromkeys(names), "_workspaces": {}}
 
     def settings(self) -> NDArray[np.void]:
-        """The agent's settings: an array of one record."""
+        """The agent's settings: an array of one record; a word is its place in its `Literal`."""
         settings = np.zeros(1, dtype=self.settings_type)
+        known, fields = type(self).__signature__.parameters, cast(Any, self.settings_type.names)
         # The first field is the class.
-        settings[0] = (0, *self._read_settings(self))
+        for name, value in zip(fields[1:], self._read_settings(self), strict=True):
+            is_word = isinstance(value, str)
+            settings[name] = words(known[name].annotation).index(value) if is_word else value
         return settings
 
     def schedules(self) -> dict[str, Schedule]:

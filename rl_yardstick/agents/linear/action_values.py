@@ -10,13 +10,10 @@ from rl_yardstick.agents.common.exploration import (
     EPSILON_GREEDY,
     action_probabilities,
     greedy_action,
-    highest_value,
 )
 from rl_yardstick.agents.common.settings import EPSILONS, FINITE, ExplorationDecay
 from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this, move_on
 from rl_yardstick.agents.compiled.references import next_uniform
-from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.agents.linear.algorithm import (
     LinearAgent,
     TileAlgorithm,
@@ -25,6 +22,8 @@ from rl_yardstick.agents.linear.algorithm import (
     look,
     sum_of,
 )
+from rl_yardstick.agents.tabular.q_learning_and_sarsa import best_next_value
+from rl_yardstick.agents.tabular.updates import learning_in_turn, next_value
 from rl_yardstick.machine_code.compiling import called
 from rl_yardstick.mdp.transition_model import Floats
 
@@ -32,61 +31,35 @@ from rl_yardstick.mdp.transition_model import Floats
 #
 # It is the temporal-difference learning of `agents.tabular`, with sums instead of table entries. If
 # each observation is a tile of its own, both are the same bit for bit. After termination the
-# discount is 0; a truncated episode still bootstraps. An algorithm defines `next_value`, and
-# `commit` if it chooses its next action before the update.
+# discount is 0; a truncated episode still bootstraps. As there, an algorithm defines `next_value`,
+# which gets the values of the next actions in ``agent.room.values``, and perhaps `commit`.
 #
 # Source: Sutton and Barto (2nd edition), section 10.1 (SARSA) and chapter 11 (Q-learning).
-
-
-@by_type
-def next_value(agent: LinearAgent, env: Any, progress: Any) -> float:
-    """The value of the next state; ``agent.room.sums`` has the values of the next actions."""
-    raise CompiledOnlyError
-
-
-@by_type_or_this
-def commit(agent: LinearAgent, env: Any, progress: Any) -> None:
-    """Choose ``env.next_action`` before the update, if the update needs it."""
 
 
 @called
 def choose_epsilon_greedily(agent: LinearAgent, progress: Any) -> int:
     """A uniformly random action with probability epsilon, else a best one."""
-    sums, explore, place = agent.room.sums, next_uniform(agent.rng), next_uniform(agent.rng)
+    values, explore, place = agent.room.values, next_uniform(agent.rng), next_uniform(agent.rng)
     if explore < progress.exploration:
-        return int(place * len(sums))
-    return greedy_action(sums, place * agent.settings.tie_scale)
+        return int(place * len(values))
+    return greedy_action(values, place * agent.settings.tie_scale)
 
 
 @called
-def semi_gradient_step(agent: LinearAgent, env: Any, progress: Any) -> float:
-    """Learn from an environment's last step, and return the TD error."""
+def semi_gradient_step(agent: LinearAgent, env: Any, progress: Any, i: int) -> float:
+    """Learn from an environment's last step, and return the absolute TD error."""
     room, weights = agent.room, agent.weights
     look(agent, env, AFTER, room.next_tiles)
     add_up(agent, room.next_tiles)
     discount = 0.0 if env.terminated else agent.settings.gamma
-    target = env.reward + discount * next_value(agent, env, progress)
+    target = env.reward + discount * next_value(agent, env, progress, 0)
     look(agent, env, BEFORE, room.tiles)
     td_error = target - sum_of(weights, room.tiles, env.action)
     step = progress.learning_rate / len(room.tiles) * td_error
     for k in range(len(room.tiles)):
         weights[room.tiles[k], env.action] += step
-    return float(td_error)
-
-
-@called
-def semi_gradient_learning(agent: LinearAgent, envs: Any, progress: Any) -> None:
-    """All commitments, then the updates in order."""
-    for i in range(len(envs)):
-        commit(agent, envs[i], progress)
-    total_error = 0.0
-    for i in range(len(envs)):
-        env = envs[i]
-        total_error += abs(semi_gradient_step(agent, env, progress))
-        move_on(agent.seen, env)
-        if env.done:
-            env.next_action = UNDECIDED
-    progress.mean_td_error = total_error / len(envs)
+    return float(abs(td_error))
 
 
 class SemiGradientAlgorithm(TileAlgorithm):
@@ -104,7 +77,8 @@ class SemiGradientAlgorithm(TileAlgorithm):
 
     # Called by the training loops; each algorithm defines `next_value`.
     choose_by_sums = choose_epsilon_greedily
-    learn_from_step = semi_gradient_learning
+    learn_from_step = learning_in_turn
+    learn_in = semi_gradient_step
     ranges = {"initial_q": FINITE, **EPSILONS}  # noqa: RUF012
 
     def __init__(
@@ -139,12 +113,6 @@ class SemiGradientAlgorithm(TileAlgorithm):
 # Semi-gradient Q-learning.
 
 
-@called
-def best_next_value(agent: LinearAgent, env: Any, progress: Any) -> float:
-    """The best next action's value."""
-    return highest_value(agent.room.sums)
-
-
 class SemiGradientQ(SemiGradientAlgorithm):
     """Semi-gradient Q-learning (Sutton and Barto, chapter 11).
 
@@ -168,9 +136,9 @@ def commit_to_next_action(agent: LinearAgent, env: Any, progress: Any) -> None:
 
 
 @called
-def committed_value(agent: LinearAgent, env: Any, progress: Any) -> float:
+def committed_value(agent: LinearAgent, env: Any, progress: Any, table: int) -> float:
     """The value of the next action that the agent has committed to."""
-    return float(agent.room.sums[env.next_action])
+    return float(agent.room.values[env.next_action])
 
 
 class SemiGradientSARSA(SemiGradientAlgorithm):

@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from rl_yardstick.agents.common.algorithm import Transitions
-from rl_yardstick.agents.common.exploration import first_best
+from rl_yardstick.agents.common.exploration import greedy_action
 from rl_yardstick.agents.common.given_spaces import in_given_spaces
 from rl_yardstick.agents.common.masks import numbers_in
 from rl_yardstick.agents.common.model_files import TablePolicy
@@ -210,7 +210,7 @@ class Room(NamedTuple):
     vector: Floats  # an observation, shape (d,)
     tiles: Ints  # the active tiles of an observation, shape (n_tilings,)
     next_tiles: Ints  # those of the next one, likewise
-    sums: Floats  # a number for each action, shape (A,)
+    values: Floats  # a number for each action, shape (A,)
 
 
 class LinearAgent(NamedTuple):
@@ -241,7 +241,7 @@ class HandedVectors(NamedTuple):
 
 @by_type
 def choose_by_sums(agent: LinearAgent, progress: Any) -> int:
-    """An action by ``agent.room.sums``."""
+    """An action by ``agent.room.values``."""
     raise CompiledOnlyError
 
 
@@ -263,10 +263,10 @@ def sum_of(weights: Floats, tiles: Ints, action: int) -> float:
 
 @called
 def add_up(agent: LinearAgent, tiles: Ints) -> None:
-    """Fill ``agent.room.sums`` with the sum of each action's weights over the tiles."""
-    sums = agent.room.sums
-    for action in range(len(sums)):
-        sums[action] = sum_of(agent.weights, tiles, action)
+    """Fill ``agent.room.values`` with the sum of each action's weights over the tiles."""
+    values = agent.room.values
+    for action in range(len(values)):
+        values[action] = sum_of(agent.weights, tiles, action)
 
 
 @called
@@ -367,7 +367,7 @@ class TilePlayer(NamedTuple):
         """Take the best action."""
         look(self, env, BEFORE, self.room.tiles)
         add_up(self, self.room.tiles)
-        env.action = first_best(self.room.sums)
+        env.action = greedy_action(self.room.values, 0.0)
 
 
 class TileAlgorithm(WorkspaceAlgorithm):

@@ -20,6 +20,7 @@ from rl_yardstick.agents.compiled.loop import move_on
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.linear.algorithm import LinearAgent, TileAlgorithm, add_up, look
+from rl_yardstick.agents.tabular.updates import learning_in_turn
 from rl_yardstick.envs.known_models import time_limit
 from rl_yardstick.machine_code.compiling import called
 from rl_yardstick.mdp.transition_model import Floats, Ints
@@ -36,14 +37,14 @@ from rl_yardstick.mdp.transition_model import Floats, Ints
 def draw_by_preference(agent: LinearAgent, progress: Any) -> int:
     """An action with probability proportional to exp(preference)."""
     uniform = next_uniform(agent.rng)
-    make_probabilities(agent.room.sums)
-    return drawn_action(agent.room.sums, uniform)
+    make_probabilities(agent.room.values)
+    return drawn_action(agent.room.values, uniform)
 
 
 @called
 def ascend(agent: LinearAgent, tiles: Ints, action: int, step: float) -> None:
     """Move the preferences at these tiles by a step along the gradient of ln pi(action)."""
-    probabilities = agent.room.sums
+    probabilities = agent.room.values
     add_up(agent, tiles)
     make_probabilities(probabilities)
     for other in range(len(probabilities)):
@@ -119,9 +120,10 @@ class Critic(NamedTuple):
 
 
 @called
-def actor_critic_step(agent: LinearAgent, env: Any, progress: Any, discount: float) -> float:
-    """Learn from an environment's last step, and return the TD error."""
-    room, values = agent.room, agent.memory.values
+def actor_critic_step(agent: LinearAgent, env: Any, progress: Any, i: int) -> float:
+    """Learn from an environment's last step, and return the absolute TD error."""
+    room, values, discounts = agent.room, agent.memory.values, agent.memory.discounts
+    discount = discounts[i] if agent.settings.gamma_power else 1.0
     look(agent, env, AFTER, room.next_tiles)
     look(agent, env, BEFORE, room.tiles)
     follows = 0.0 if env.terminated else agent.settings.gamma * state_value(values, room.next_tiles)
@@ -132,20 +134,8 @@ def actor_critic_step(agent: LinearAgent, env: Any, progress: Any, discount: flo
         values[room.tiles[k]] += value_step
     step = progress.learning_rate / n_tilings * discount * td_error
     ascend(agent, room.tiles, env.action, step)
-    return float(td_error)
-
-
-@called
-def actor_critic_learning(agent: LinearAgent, envs: Any, progress: Any) -> None:
-    """Update for each environment in order."""
-    total_error, discounts = 0.0, agent.memory.discounts
-    for i in range(len(envs)):
-        env = envs[i]
-        discount = discounts[i] if agent.settings.gamma_power else 1.0
-        total_error += abs(actor_critic_step(agent, env, progress, discount))
-        discounts[i] = 1.0 if env.done else discounts[i] * agent.settings.gamma
-        move_on(agent.seen, env)
-    progress.mean_td_error = total_error / len(envs)
+    discounts[i] = 1.0 if env.done else discounts[i] * agent.settings.gamma
+    return float(abs(td_error))
 
 
 class ActorCritic(SoftmaxAlgorithm):
@@ -161,7 +151,8 @@ class ActorCritic(SoftmaxAlgorithm):
 
     parameters = {"value_step_size": np.float64}  # noqa: RUF012
     ranges = {"value_step_size": NOT_NEGATIVE}  # noqa: RUF012
-    learn_from_step = actor_critic_learning
+    learn_from_step = learning_in_turn
+    learn_in = actor_critic_step
     values_states = True
     _memory: Critic
 

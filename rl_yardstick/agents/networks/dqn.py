@@ -11,9 +11,10 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import Schedule, TrainFrequencyUnit
 from stable_baselines3.common.utils import update_learning_rate
+from torch import nn
 
 from rl_yardstick.agents.common.callbacks import Horizon
-from rl_yardstick.agents.common.exploration import first_best
+from rl_yardstick.agents.common.exploration import greedy_action
 from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, Numbers, look, observe, show
 from rl_yardstick.agents.compiled.loop import move_on
 from rl_yardstick.agents.compiled.references import (
@@ -31,12 +32,7 @@ from rl_yardstick.agents.networks.engine import (
     network_of,
     record_of,
 )
-from rl_yardstick.agents.networks.engine_setting import (
-    STEPS_OF_EPISODE,
-    CompiledNetworks,
-    Work,
-    work_of,
-)
+from rl_yardstick.agents.networks.engine_setting import STEPS_OF_EPISODE, CompiledNetworks
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -175,7 +171,7 @@ def learn_from_minibatch(learner: Any, learning_rate: float, _: float) -> int:
         forward(layers, learner.flat, batch.next_states, n, learner.outputs)
         preferred = last_outputs(layers, learner.outputs, n)
     for i in range(n):
-        batch.rewards[i] += batch.discounts[i] * next_values[i, first_best(preferred[i])]
+        batch.rewards[i] += batch.discounts[i] * next_values[i, greedy_action(preferred[i], 0.0)]
     forward(layers, learner.flat, batch.states, n, learner.outputs)
     learner.place[0].losses += _errors(learner, n, rules.largest_error)
     backward(
@@ -281,7 +277,7 @@ class QLearner(NamedTuple):
 def choose_greedily(learner: Any, _: float, __: float) -> int:
     """The best action for the observation in ``learner.single``."""
     forward(learner.layers, learner.flat, learner.single, 1, learner.single_outputs)
-    return first_best(last_outputs(learner.layers, learner.single_outputs, 1)[0])
+    return greedy_action(last_outputs(learner.layers, learner.single_outputs, 1)[0], 0.0)
 
 
 @kernel
@@ -611,7 +607,7 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
         )
         return [ours], [lagging]
 
-    def _work_of(self, n_steps: float) -> Work:
+    def _planned(self, n_steps: float) -> tuple[list[nn.Module], float, float, int]:
         train_freq: Any = self.train_freq
         frequency = float(train_freq.frequency)
         if train_freq.unit == TrainFrequencyUnit.EPISODE:
@@ -619,8 +615,7 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
         between = frequency * self.n_envs
         at_once = self.gradient_steps if self.gradient_steps >= 0 else between
         n_updates = max(n_steps - self.learning_starts, 0.0) / between * at_once
-        seen = self.observation_space
-        return work_of("q", [self.q_net], seen, n_steps, self.n_envs, n_updates, self.batch_size)
+        return [self.q_net], n_steps, n_updates, self.batch_size
 
     def schedules(self) -> dict[str, Schedule]:
         return {**super().schedules(), "exploration": self.exploration_schedule}

@@ -16,7 +16,7 @@ from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from torch import nn
 
 from rl_yardstick.agents.common.callbacks import Horizon, horizon
-from rl_yardstick.agents.common.exploration import first_best
+from rl_yardstick.agents.common.exploration import greedy_action
 from rl_yardstick.agents.compiled.engine import CompiledEngine
 from rl_yardstick.agents.compiled.env_states import BEFORE, Numbers, look
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
@@ -396,7 +396,7 @@ def choose_surely(network: Any, _: float, __: float) -> int:
     """The best action for the observation in ``network.single``."""
     forward(network.layers, network.flat, network.single, 1, network.single_outputs)
     outputs = last_outputs(network.layers, network.single_outputs, 1)[0]
-    best, unsure = first_best(outputs), _unsure(network, outputs)
+    best, unsure = greedy_action(outputs, 0.0), _unsure(network, outputs)
     for k in range(len(outputs)):
         # With nan the comparison is False, too.
         if k != best and not outputs[best] - outputs[k] > unsure:

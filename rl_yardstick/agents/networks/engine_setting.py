@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self, get_args
@@ -128,26 +127,6 @@ class Work:
         return self.n_steps * step + self.n_updates * self.batch_size * row
 
 
-def work_of(
-    kind: Literal["q", "policy"],
-    networks: Sequence[nn.Module],
-    observations: spaces.Space[Any],
-    n_steps: float,
-    n_envs: int,
-    n_updates: float,
-    batch_size: float,
-) -> Work:
-    """The work of a training of these networks; other arguments are attributes of `Work`."""
-    linears = [[m for m in net.modules() if isinstance(m, nn.Linear)] for net in networks]
-    n_weights = sum(layer.weight.numel() for layers in linears for layer in layers)
-    is_one_hot = isinstance(observations, spaces.Discrete)
-    by_number = sum(layers[0].weight.numel() for layers in linears if is_one_hot and layers)
-    n_layers = max(len(layers) for layers in linears)
-    return Work(
-        kind, n_steps, n_envs, n_updates, batch_size, n_layers, n_weights, n_weights - by_number
-    )
-
-
 # The argument ``engine`` of the library's agents, and its effect on training.
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
@@ -223,13 +202,6 @@ class CompiledNetworks(BaseAlgorithm):
         super().set_random_seed(seed)
         (self.rng,) = np.random.default_rng(seed).spawn(1)
 
-    def _check_compilable(self) -> None:
-        """Raise `NotCompilable` if compiled code cannot do all that the agent does."""
-        check_agent(self)
-        self._check_own()
-        check_optimizer(self.policy.optimizer)
-        self.shared_networks(self._seen_in_python())
-
     @abstractmethod
     def _check_own(self) -> None:
         """Raise `NotCompilable` for settings of this kind of agent that are not supported."""
@@ -288,7 +260,10 @@ class CompiledNetworks(BaseAlgorithm):
         if engine == "library":
             return EnginePlan(is_compiled=False)
         try:
-            self._check_compilable()
+            check_agent(self)
+            self._check_own()
+            check_optimizer(self.policy.optimizer)
+            self.shared_networks(self._seen_in_python())
         except NotCompilable as reason:
             return EnginePlan(is_compiled=False, reason=str(reason))
         if engine == "auto":
@@ -306,11 +281,25 @@ class CompiledNetworks(BaseAlgorithm):
         for each in _each(callback):
             if isinstance(each, EpisodeBudget):
                 steps = min(steps, float(each.n_episodes * STEPS_OF_EPISODE))
-        return self._work_of(steps)
+        networks, steps, n_updates, batch_size = self._planned(steps)
+        linears = [[m for m in net.modules() if isinstance(m, nn.Linear)] for net in networks]
+        n_weights = sum(layer.weight.numel() for layers in linears for layer in layers)
+        is_one_hot = isinstance(self.observation_space, spaces.Discrete)
+        by_number = sum(layers[0].weight.numel() for layers in linears if is_one_hot and layers)
+        return Work(
+            "policy" if len(networks) > 1 else "q",
+            steps,
+            self.n_envs,
+            n_updates,
+            batch_size,
+            max(len(layers) for layers in linears),
+            n_weights,
+            n_weights - by_number,
+        )
 
     @abstractmethod
-    def _work_of(self, n_steps: float) -> Work:
-        """The work of a training of ``n_steps`` steps."""
+    def _planned(self, n_steps: float) -> tuple[list[nn.Module], float, float, int]:
+        """The networks, the steps of whole rollouts, their minibatches, and the rows of one."""
 
     def _shared_training(self) -> Any:
         """The current training, made at the first rollout.

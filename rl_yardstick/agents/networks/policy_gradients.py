@@ -37,7 +37,7 @@ from rl_yardstick.agents.networks.engine import (
     network_of,
     record_of,
 )
-from rl_yardstick.agents.networks.engine_setting import CompiledNetworks, Work, work_of
+from rl_yardstick.agents.networks.engine_setting import CompiledNetworks
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -96,7 +96,7 @@ def fill_probabilities(logits: Singles, normalizer: float, probabilities: Any) -
 
 
 class Rollout(NamedTuple):
-    """The library's rollout buffer without observations: T steps of E environments."""
+    """The library's rollout buffer without observations, by its names: T steps, E environments."""
 
     actions: Ints  # shape (T, E, 1)
     rewards: Singles  # shape (T, E)
@@ -615,15 +615,7 @@ class PolicyTraining(NetworkTraining):
         if buffer.generator_ready:
             # The library has flattened the buffer for its own minibatches.
             buffer.reset()
-        return Rollout(
-            buffer.actions,
-            buffer.rewards,
-            buffer.episode_starts,
-            buffer.values,
-            buffer.log_probs,
-            buffer.advantages,
-            buffer.returns,
-        )
+        return Rollout(*(getattr(buffer, name) for name in Rollout._fields))
 
     def in_loop(self) -> PolicyAgent:
         """The agent for the compiled loop."""
@@ -797,20 +789,13 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         critic = network_of([*value_body, value_head], start, one_hot=one_hot)
         return [actor, critic], []
 
-    def _work_of(self, n_steps: float) -> Work:
+    def _planned(self, n_steps: float) -> tuple[list[nn.Module], float, float, int]:
         rollout = self.n_steps * self.n_envs
         batch_size = getattr(self, "batch_size", rollout)
         n_rollouts = math.ceil(n_steps / rollout)
         n_updates = n_rollouts * getattr(self, "n_epochs", 1) * math.ceil(rollout / batch_size)
-        return work_of(
-            "policy",
-            [nn.ModuleList(parts) for parts in self._parts()],
-            self.observation_space,
-            n_rollouts * rollout,
-            self.n_envs,
-            n_updates,
-            batch_size,
-        )
+        networks: list[nn.Module] = [nn.ModuleList(parts) for parts in self._parts()]
+        return networks, n_rollouts * rollout, n_updates, batch_size
 
     def collect_rollouts(
         self,

@@ -289,7 +289,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     # Arguments of compiled functions.
 
-    def compiled_agent(self, rng: np.random.Generator, seen: Any = None) -> TabularAgent:
+    def compiled_agent(self, rng: np.random.Generator, seen: Any = ()) -> TabularAgent:
         """The agent for compiled functions, with its tables in the memory of its policy."""
         policy = self.policy
         values, counts = policy.q_tables.numpy(), policy.visit_counts.numpy()
@@ -303,6 +303,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             Room(np.empty(n_actions), np.arange(n_actions), np.empty(n_draws)),
             handles_of([rng])[0],
             self._memory_in_use(),
+            seen,
         )
 
     def greedy_player(self, seen: Any) -> Plan:

@@ -15,7 +15,14 @@ from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_typ
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.agents.tabular.q_learning_and_sarsa import QLearning
-from rl_yardstick.agents.tabular.updates import TabularAgent, action_at, best_value, room_at, update
+from rl_yardstick.agents.tabular.updates import (
+    TabularAgent,
+    action_at,
+    best_value,
+    learning_in_turn,
+    room_at,
+    update,
+)
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 
@@ -127,6 +134,7 @@ class ModelKeeper(TabularAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": ModelPolicy}
     policy: ModelPolicy
+    learn_from_step = learning_in_turn
     outcomes_kept: int = 1  # number of outcomes in the model for each pair of state and action
 
     def _memory_in_use(self) -> Any:
@@ -182,18 +190,15 @@ def imagine_step(agent: TabularAgent, progress: Any) -> None:
 
 
 @inlined
-def learn_and_plan(agent: TabularAgent, envs: Any, progress: Any) -> None:
-    """For each environment, in order: learn from its step, remember it, and plan."""
-    total_error = 0.0
-    for i in range(len(envs)):
-        env = envs[i]
-        if not (env.terminated and agent.settings.skip_terminal_update):
-            total_error += abs(update(agent, env, progress))
-            remember(agent, env)
-            for _ in range(agent.settings.planning_steps):
-                imagine_step(agent, progress)
-        env.obs = env.new_obs
-    progress.mean_td_error = total_error if len(envs) == 1 else total_error / len(envs)
+def learn_and_plan(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
+    """Learn from the environment's step, remember it, and plan."""
+    if env.terminated and agent.settings.skip_terminal_update:
+        return 0.0
+    error = abs(update(agent, env, progress))
+    remember(agent, env)
+    for _ in range(agent.settings.planning_steps):
+        imagine_step(agent, progress)
+    return error
 
 
 class DynaQ(ModelKeeper, QLearning):
@@ -214,7 +219,7 @@ class DynaQ(ModelKeeper, QLearning):
 
     parameters = {"planning_steps": np.int64}  # noqa: RUF012
     ranges = {"planning_steps": whole(0), "outcomes_kept": whole(1)}  # noqa: RUF012
-    learn_from_step = learn_and_plan
+    learn_in = learn_and_plan
     remember = remember_outcome
 
     def __init__(

@@ -13,13 +13,9 @@ from rl_yardstick.agents.common.settings import whole
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy
-from rl_yardstick.agents.tabular.n_step import (
-    NOTHING_LEARNT,
-    EpisodicAlgorithm,
-    place_of,
-    probability_of,
-)
+from rl_yardstick.agents.tabular.n_step import EpisodicAlgorithm, place_of, probability_of
 from rl_yardstick.agents.tabular.updates import (
+    NOTHING_LEARNT,
     TabularAgent,
     act_on_values,
     choose,

@@ -7,14 +7,9 @@ from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 
-from rl_yardstick.agents.common.exploration import (
-    action_probability,
-    expected_value,
-    highest_value,
-)
+from rl_yardstick.agents.common.exploration import action_probability, expected_value, highest_value
 from rl_yardstick.agents.common.settings import SHARE, whole
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
-from rl_yardstick.agents.compiled.worlds import UNDECIDED
+from rl_yardstick.agents.compiled.loop import by_type_or_this
 from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
 from rl_yardstick.agents.tabular.q_learning_and_sarsa import (
     best_next_value,
@@ -22,12 +17,13 @@ from rl_yardstick.agents.tabular.q_learning_and_sarsa import (
     committed_value,
 )
 from rl_yardstick.agents.tabular.updates import (
+    NOTHING_LEARNT,
     Room,
     TabularAgent,
     action_at,
-    commit,
     count_visit,
     exploration_rate,
+    learning_in_turn,
     move_towards,
     value_ahead,
     values_at,
@@ -35,34 +31,7 @@ from rl_yardstick.agents.tabular.updates import (
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
-# Learning from the environments one after the other, with a memory of each of their episodes.
-
-NOTHING_LEARNT = -1.0
-
-
-@by_type
-def learn_in(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
-    """Learn from the step of environment ``i``."""
-    raise CompiledOnlyError
-
-
-@inlined
-def learning_in_turn(agent: TabularAgent, envs: Any, progress: Any) -> None:
-    """All commitments, then the environments in order."""
-    for i in range(len(envs)):
-        commit(agent, envs[i], progress)
-    total_error, n_learnt = 0.0, 0
-    for i in range(len(envs)):
-        env = envs[i]
-        error = learn_in(agent, env, progress, i)
-        if error >= 0.0:
-            total_error += error
-            n_learnt += 1
-        env.obs = env.new_obs
-        if env.done:
-            env.next_action = UNDECIDED
-    if n_learnt > 0:
-        progress.mean_td_error = total_error / n_learnt
+# The probabilities of actions, and the base of agents with a memory of their episodes.
 
 
 @inlined
@@ -213,12 +182,13 @@ class NStepSARSA(WindowAlgorithm):
 # n-step tree backup.
 
 TargetPolicy = Literal["exploring", "greedy"]
+GREEDY = 1
 
 
 @inlined
 def target_mean(agent: TabularAgent, room: Room, progress: Any) -> float:
     """The mean of the values in the room under the target policy."""
-    if agent.settings.targets_greedy:
+    if agent.settings.target_policy == GREEDY:
         return highest_value(room.values)
     rate = exploration_rate(agent, progress)
     return float(expected_value(agent.settings.strategy, room.values, rate))
@@ -227,7 +197,7 @@ def target_mean(agent: TabularAgent, room: Room, progress: Any) -> float:
 @inlined
 def target_probability(agent: TabularAgent, room: Room, action: int, progress: Any) -> float:
     """The target policy's probability of the action; the greedy one gives 1 to any best action."""
-    if not agent.settings.targets_greedy:
+    if agent.settings.target_policy != GREEDY:
         return probability_of(agent, room, action, progress)
     place = place_of(agent, room, action)
     return 1.0 if place >= 0 and room.values[place] == highest_value(room.values) else 0.0
@@ -262,7 +232,7 @@ class NStepTreeBackup(WindowAlgorithm):
             present epsilon or temperature, or the ``"greedy"`` one.
     """
 
-    parameters = {"targets_greedy": np.bool_}  # noqa: RUF012
+    parameters = {"target_policy": np.int64}  # noqa: RUF012
     next_value = target_value_ahead
     backed_up = tree_backed_up
 
@@ -272,14 +242,9 @@ class NStepTreeBackup(WindowAlgorithm):
         self.target_policy = target_policy
         super().__init__(*args, **kwargs)
 
-    @property
-    def targets_greedy(self) -> bool:
-        """Whether the target policy is greedy."""
-        return self.target_policy == "greedy"
-
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        if not self.targets_greedy:
+        if self.target_policy != "greedy":
             self._refuse_gaussian_noise("target_policy: exploring")
 
 
@@ -291,8 +256,7 @@ class NStepTreeBackup(WindowAlgorithm):
 # Source: Sutton and Barto (2nd edition), chapter 12.
 
 TraceType = Literal["accumulating", "replacing", "dutch"]
-ACCUMULATING, REPLACING, DUTCH = 0, 1, 2
-TRACE_TYPES = {"accumulating": ACCUMULATING, "replacing": REPLACING, "dutch": DUTCH}
+ACCUMULATING, REPLACING, DUTCH = range(3)
 
 # Smaller traces are dropped: their effect is below the rounding error of most tables.
 SMALLEST_TRACE = 1e-12
@@ -359,11 +323,11 @@ def learn_along_traces(agent: TabularAgent, env: Any, progress: Any, i: int) -> 
     earlier = fade(traces, i, factor, env.obs, env.action)
     n_others = traces.lengths[i]
     has_past = n_others > 0 or earlier != 0.0
-    late = value - traces.expected[i] if settings.trace_kind == DUTCH and has_past else 0.0
+    late = value - traces.expected[i] if settings.trace_type == DUTCH and has_past else 0.0
     for k in range(n_others):
         change = (td_error + late) * traces.sizes[i, k]
         values[0, traces.states[i, k], traces.actions[i, k]] += change
-    trace = visited(settings.trace_kind, size, earlier)
+    trace = visited(settings.trace_type, size, earlier)
     values[0, env.obs, env.action] += td_error * trace + late * (trace - size)
     traces.states[i, n_others] = env.obs
     traces.actions[i, n_others] = env.action
@@ -388,7 +352,7 @@ class TraceAlgorithm(EpisodicAlgorithm):
             TD(lambda).
     """
 
-    parameters = {"trace_decay": np.float64, "trace_kind": np.int64}  # noqa: RUF012
+    parameters = {"trace_decay": np.float64, "trace_type": np.int64}  # noqa: RUF012
     ranges = {"trace_decay": SHARE}  # noqa: RUF012
     learn_in = learn_along_traces
 
@@ -402,11 +366,6 @@ class TraceAlgorithm(EpisodicAlgorithm):
         self.trace_decay = trace_decay
         self.trace_type = trace_type
         super().__init__(*args, **kwargs)
-
-    @property
-    def trace_kind(self) -> int:
-        """The number of ``trace_type``."""
-        return TRACE_TYPES[self.trace_type]
 
     def _make_memory(self) -> Traces:
         sizes = cast(Any, (self.observation_space, self.action_space))

@@ -21,7 +21,7 @@ from rl_yardstick.agents.common.settings import (
 from rl_yardstick.agents.compiled.engine import EngineChoice
 from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
 from rl_yardstick.agents.tabular.dyna import ModelKeeper, ModelPolicy
-from rl_yardstick.agents.tabular.updates import TabularAgent, best_value
+from rl_yardstick.agents.tabular.updates import TabularAgent, best_value, learning_in_turn
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 
@@ -52,6 +52,7 @@ class OptimisticAlgorithm(TabularAlgorithm):
 
     parameters = {"highest_worth": np.float64}  # noqa: RUF012
     ranges = {"value_bound": FINITE}  # noqa: RUF012
+    learn_from_step = learning_in_turn
     hidden_arguments = (
         *("learning_rate", "exploration", "exploration_decay", *EPSILONS, "temperature"),
         *("noise_std", "initial_q", "initial_q_std", "skip_terminal_update"),
@@ -99,8 +100,8 @@ class OptimisticAlgorithm(TabularAlgorithm):
 
 
 @inlined
-def optimistic_update(agent: TabularAgent, env: Any) -> float:
-    """Move one entry towards its target plus a bonus for rare tries; return its TD error."""
+def optimistic_update(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
+    """Move one entry towards its target plus a bonus for rare tries; return its absolute error."""
     settings, tables = agent.settings, agent.tables
     tables.visit_counts[0, env.obs, env.action] += 1
     count = tables.visit_counts[0, env.obs, env.action]
@@ -111,17 +112,7 @@ def optimistic_update(agent: TabularAgent, env: Any) -> float:
     size = (settings.steps_remembered + 1.0) / (settings.steps_remembered + count)
     td_error = target - tables.values[0, env.obs, env.action]
     tables.values[0, env.obs, env.action] += size * td_error
-    return float(td_error)
-
-
-@inlined
-def learn_with_bonus(agent: TabularAgent, envs: Any, progress: Any) -> None:
-    """An update for each environment, in order."""
-    total_error = 0.0
-    for i in range(len(envs)):
-        total_error += abs(optimistic_update(agent, envs[i]))
-        envs[i].obs = envs[i].new_obs
-    progress.mean_td_error = total_error / len(envs)
+    return float(abs(td_error))
 
 
 class QLearningUCB(OptimisticAlgorithm):
@@ -148,7 +139,7 @@ class QLearningUCB(OptimisticAlgorithm):
 
     parameters = {"bonus_scale": np.float64, "steps_remembered": np.float64}  # noqa: RUF012
     ranges = {"bonus_scale": NOT_NEGATIVE, "horizon": NOT_NEGATIVE}  # noqa: RUF012
-    learn_from_step = learn_with_bonus
+    learn_in = optimistic_update
 
     def __init__(
         self, *args: Any, bonus_scale: float = 0.1, horizon: float | None = None, **kwargs: Any
@@ -268,22 +259,19 @@ def replan(agent: TabularAgent) -> None:
 
 
 @inlined
-def learn_and_replan(agent: TabularAgent, envs: Any, progress: Any) -> None:
-    """For each environment, in order: count its step, and plan if that makes its pair known."""
-    model, total_error = agent.memory, 0.0
-    for i in range(len(envs)):
-        env = envs[i]
-        following = 0.0 if env.terminated else best_value(agent.tables, env.next_obs, agent.room)
-        target = env.reward + agent.settings.gamma * following
-        total_error += abs(target - agent.tables.values[0, env.obs, env.action])
-        agent.tables.visit_counts[0, env.obs, env.action] += 1
-        if model.counts[env.obs, env.action] < model.tallies.shape[2]:
-            count_outcome(model, env)
-            if model.counts[env.obs, env.action] == model.tallies.shape[2]:
-                note_known_state(model, env.obs)
-                replan(agent)
-        env.obs = env.new_obs
-    progress.mean_td_error = total_error / len(envs)
+def learn_and_replan(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
+    """Count the environment's step, and plan if that makes its pair known."""
+    model, obs, action = agent.memory, env.obs, env.action
+    following = 0.0 if env.terminated else best_value(agent.tables, env.next_obs, agent.room)
+    target = env.reward + agent.settings.gamma * following
+    error = abs(target - agent.tables.values[0, obs, action])
+    agent.tables.visit_counts[0, obs, action] += 1
+    if model.counts[obs, action] < model.tallies.shape[2]:
+        count_outcome(model, env)
+        if model.counts[obs, action] == model.tallies.shape[2]:
+            note_known_state(model, obs)
+            replan(agent)
+    return float(error)
 
 
 class CountedModelPolicy(ModelPolicy):
@@ -342,7 +330,7 @@ class RMax(ModelKeeper, OptimisticAlgorithm):
     policy_aliases = {"QTablePolicy": CountedModelPolicy}  # noqa: RUF012
     parameters = {"tolerance": np.float64}  # noqa: RUF012
     ranges = {"known_after": whole(1), "tolerance": POSITIVE}  # noqa: RUF012
-    learn_from_step = learn_and_replan
+    learn_in = learn_and_replan
 
     def __init__(
         self, *args: Any, known_after: int = 10, tolerance: float = 1e-4, **kwargs: Any

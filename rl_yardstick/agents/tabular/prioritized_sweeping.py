@@ -202,22 +202,18 @@ def sweep(agent: TabularAgent, progress: Any) -> None:
 
 
 @inlined
-def remember_and_sweep(agent: TabularAgent, envs: Any, progress: Any) -> None:
-    """For each environment, in order: store its step, and update the most urgent pairs."""
-    total_error = 0.0
-    for i in range(len(envs)):
-        env = envs[i]
-        if not (env.terminated and agent.settings.skip_terminal_update):
-            remember_step(agent.memory, env)
-            agent.tables.visit_counts[0, env.obs, env.action] += 1
-            pair = env.obs * agent.tables.values.shape[2] + env.action
-            total_error += abs(notice(agent, pair))
-            for _ in range(agent.settings.planning_steps):
-                if agent.memory.n_queued[0] == 0:
-                    break
-                sweep(agent, progress)
-        env.obs = env.new_obs
-    progress.mean_td_error = total_error / len(envs)
+def remember_and_sweep(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
+    """Store the environment's step, and update the most urgent pairs."""
+    if env.terminated and agent.settings.skip_terminal_update:
+        return 0.0
+    remember_step(agent.memory, env)
+    agent.tables.visit_counts[0, env.obs, env.action] += 1
+    error = abs(notice(agent, env.obs * agent.tables.values.shape[2] + env.action))
+    for _ in range(agent.settings.planning_steps):
+        if agent.memory.n_queued[0] == 0:
+            break
+        sweep(agent, progress)
+    return error
 
 
 class PrioritizedSweeping(ModelKeeper):
@@ -239,7 +235,7 @@ class PrioritizedSweeping(ModelKeeper):
     policy_aliases = {"QTablePolicy": SweepingPolicy}  # noqa: RUF012
     parameters = {"planning_steps": np.int64, "threshold": np.float64}  # noqa: RUF012
     ranges = {"planning_steps": whole(0), "threshold": NOT_NEGATIVE}  # noqa: RUF012
-    learn_from_step = remember_and_sweep
+    learn_in = remember_and_sweep
 
     def __init__(
         self, *args: Any, planning_steps: int = 5, threshold: float = 1e-4, **kwargs: Any

@@ -4,17 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from rl_yardstick.agents.common.exploration import (
-    expected_value,
-    greedy_action,
-    highest_value,
-)
+from rl_yardstick.agents.common.exploration import expected_value, greedy_action, highest_value
 from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
-from rl_yardstick.agents.tabular.updates import (
-    TabularAgent,
-    choose,
-    exploration_rate,
-)
+from rl_yardstick.agents.tabular.updates import TabularAgent, choose, exploration_rate
 from rl_yardstick.machine_code.compiling import inlined
 
 # Q-learning.

@@ -11,7 +11,7 @@ from rl_yardstick.agents.common.exploration import (
     random_action,
 )
 from rl_yardstick.agents.common.settings import step_size
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this, move_on
 from rl_yardstick.agents.compiled.references import generator_of, next_uniform
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.machine_code.compiling import inlined
@@ -139,10 +139,11 @@ class TabularAgent(NamedTuple):
     room: Room  # scratch arrays
     rng: Any  # a handle of its generator
     memory: Any  # further arrays of its algorithm; see `TabularAlgorithm`
+    seen: Any  # how observations are read; they are numbers, so it is not used
 
 
 @by_type
-def next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
+def next_value(agent: Any, env: Any, progress: Any, table: int) -> float:
     """The value of the next state in the target of an update of ``table``.
 
     ``agent.room.values`` has the values of that table in ``env.next_obs``, for the allowed actions
@@ -153,7 +154,7 @@ def next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> floa
 
 
 @by_type_or_this
-def commit(agent: TabularAgent, env: Any, progress: Any) -> None:
+def commit(agent: Any, env: Any, progress: Any) -> None:
     """Choose ``env.next_action``, or store anything else that is needed from unchanged tables."""
 
 
@@ -206,7 +207,7 @@ def values_at(agent: TabularAgent, obs: int, table: int) -> Room:
 def value_ahead(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
     """`next_value`, after filling the room that it needs."""
     room = values_at(agent, env.next_obs, table)
-    ahead = TabularAgent(agent.settings, agent.tables, room, agent.rng, agent.memory)
+    ahead = TabularAgent(agent.settings, agent.tables, room, agent.rng, agent.memory, agent.seen)
     return float(next_value(ahead, env, progress, table))
 
 
@@ -262,3 +263,33 @@ def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
         if env.done:
             env.next_action = UNDECIDED
     progress.mean_td_error = total_error if len(envs) == 1 else total_error / len(envs)
+
+
+# Learning from the environments one after the other, for agents that plan or keep more than a step.
+
+NOTHING_LEARNT = -1.0
+
+
+@by_type
+def learn_in(agent: Any, env: Any, progress: Any, i: int) -> float:
+    """Learn from the step of environment ``i``; the absolute TD error, or `NOTHING_LEARNT`."""
+    raise CompiledOnlyError
+
+
+@inlined
+def learning_in_turn(agent: Any, envs: Any, progress: Any) -> None:
+    """All commitments, then the environments in order."""
+    for i in range(len(envs)):
+        commit(agent, envs[i], progress)
+    total_error, n_learnt = 0.0, 0
+    for i in range(len(envs)):
+        env = envs[i]
+        error = learn_in(agent, env, progress, i)
+        if error != NOTHING_LEARNT:
+            total_error += error
+            n_learnt += 1
+        move_on(agent.seen, env)
+        if env.done:
+            env.next_action = UNDECIDED
+    if n_learnt > 0:
+        progress.mean_td_error = total_error / n_learnt
