@@ -27,6 +27,8 @@ for library in ("OMP", "MKL", "OPENBLAS", "NUMBA"):
 CONFIGURATION = tempfile.TemporaryDirectory(prefix="yardstick-tests-")
 os.environ["XDG_CONFIG_HOME"] = CONFIGURATION.name
 
+import rl_yardstick.envs  # noqa: E402, F401  # registers the environments for all tests
+
 # No deadline: the first example of a compiled function pays for its compilation. In CI the examples
 # are the same every time, so that a failure there can be repeated.
 hypothesis.settings.register_profile("yardstick", deadline=None, derandomize="CI" in os.environ)
@@ -120,7 +122,6 @@ def own_folder(monkeypatch, tmp_path):
     """A user's folder, in which commands are typed; what is imported from there goes afterwards."""
     import gymnasium as gym
 
-    import rl_yardstick.envs  # noqa: F401  # before the registry is looked at
     from rl_yardstick.agents import ALGORITHMS
 
     (tmp_path / "own").mkdir()
@@ -163,6 +164,14 @@ def typed(capfd):
 def type_in_own_folder(own_folder, typed):
     """As `typed`, inside a user's folder."""
     return typed
+
+
+@pytest.fixture
+def quick_runs(monkeypatch):
+    """Runs without pictures and with few evaluated steps, which take most of a short run."""
+    monkeypatch.setattr("rl_yardstick.pipeline.training.draw", lambda *_: None)
+    place = "rl_yardstick.pipeline.evaluation.sampled.STEPS_IN_ANY_CASE"
+    monkeypatch.setattr(place, 200)
 
 
 def call(function, *args):

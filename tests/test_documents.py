@@ -68,8 +68,6 @@ def test_commands_can_be_carried_out(tmp_path, monkeypatch, command):
 def test_there_are_commands_to_check():
     counts = Counter(command.removeprefix("-m rl_yardstick ").split()[0] for command in FOUND_IN)
     assert counts["compare.py"] >= 20
-    assert counts["train.py"] >= 6
-    assert min(counts["enjoy.py"], counts["tune.py"]) >= 2
     assert all(counts[script] for script in MODULES)
     assert len(SAMPLE) > 10
 

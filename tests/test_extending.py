@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 import gymnasium as gym
+import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
 DOCUMENT = (DOCS / "extending.md").read_text() + (DOCS / "own-agent.md").read_text()
@@ -15,7 +16,9 @@ CONTRIBUTING = (DOCS.parent / "CONTRIBUTING.md").read_text()
 COMMANDS = re.findall(r"^python ~/yardstick/(.*)$", DOCUMENT, re.M)
 
 
-def test_the_document_can_be_followed(type_in_own_folder, own_folder, in_this_process):
+@pytest.mark.usefixtures("in_this_process", "quick_runs")
+def test_the_document_can_be_followed(type_in_own_folder, own_folder, monkeypatch):
+    monkeypatch.setattr("rl_yardstick.pipeline.evaluation.sampled.STEPS_AT_FIRST", 200)
     for name, text in FILES:
         (own_folder / name).write_text(text)
     assert len(FILES) >= 6

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 GOLDEN = Path(__file__).parent / "golden"
-SAMPLE = ("run table*", "plan FrozenLake-v1 *", "train FrozenLake-v1 qlearning")
-PLACES = ("anywhere", "python", "here")
+SAMPLE = ("run table", "plan FrozenLake-v1 *", "train FrozenLake-v1 qlearning")
+PLACES = ("anywhere", "here")
 
 
 def test_a_sample_is_as_it_was_recorded():
@@ -18,7 +18,7 @@ def test_a_sample_is_as_it_was_recorded():
         [sys.executable, GOLDEN, "--only", *SAMPLE], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
-    assert int(done.stdout.split()[0]) == 7, "most of the sample is not there any more"
+    assert int(done.stdout.split()[0]) == 6, "most of the sample is not there any more"
 
 
 OTHER = {"capability": "AVX1024"}
@@ -35,8 +35,6 @@ ROWS = [
     ("1", "anywhere", "2", OTHER, SAID),
     ("1", "here", "2", OTHER, ELSEWHERE),
     ("1", "here", "1", OTHER, []),
-    ("1", "python", "2", OTHER, SAID),
-    ("1", "python", "2", {"python": "3.1"}, ["not comparable here: *"]),
 ]
 
 

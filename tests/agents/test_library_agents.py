@@ -17,7 +17,6 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
-import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.agents.common.schedules import ExponentialSchedule, library_schedule

@@ -9,8 +9,6 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-import rl_yardstick.envs  # noqa: F401  # registers the environments
-from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.linear.algorithm import make_tiles, tiles_of_all
 from tests.agents.hand_fed import Told
 
@@ -210,22 +208,6 @@ def test_values_and_preferences_begin_where_they_are_told_to():
     drawn = told.agent.predict(np.zeros(20_000, dtype=int))[0]
     assert drawn.mean() == pytest.approx(0.05, abs=5 * np.sqrt(0.05 * 0.95 / 20_000))
     assert told.agent.predict(np.array([0, 1]), deterministic=True)[0].tolist() == [0, 0]
-
-
-CHANCE = {"initial_preferences": [1.47, -1.47]}
-CORRIDOR = [  # within a tenth of the best, -11.66; bootstrapping fails, as all states look alike
-    ("reinforce", {**CHANCE, "learning_rate": 2**-9, "baseline": "value",
-                   "value_step_size": 2**-6}, True),
-    ("actor_critic", {"learning_rate": 2**-6, "value_step_size": 2**-4}, False),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "settings", "is_learnt"), CORRIDOR)
-def test_the_corridor_is_left_by_chance_and_defeats_bootstrapping(name, settings, is_learnt):
-    model = load_algorithm(name)(env="ShortCorridor-v0", seed=0, **settings).learn(60_000)
-    right = model.action_probabilities()[0, 1]
-    steps = (4 - 2 * right) / (right * (1 - right))
-    assert steps < 1.1 * 11.66 if is_learnt else steps > 10 * 11.66
 
 
 def test_a_step_of_one_goes_along_the_gradient_of_the_logarithm():

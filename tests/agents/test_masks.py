@@ -14,7 +14,6 @@ from hypothesis.extra import numpy as hnp
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from rl_yardstick.agents.bandits.algorithm import Pull
 from rl_yardstick.agents.library import DQN, DoubleDQN

@@ -20,7 +20,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 from torch.distributions import Categorical
 
-import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon
 from rl_yardstick.envs.wrappers import OneHotObservation

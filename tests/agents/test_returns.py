@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.env_util import make_vec_env
 
-import rl_yardstick.envs  # noqa: F401  # registers the environments
-from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.exploration import EPSILON_GREEDY, action_probabilities
 from tests.agents.hand_fed import ENDS, EPISODES, N_ACTIONS, N_STATES, SHARES, TABLES, Fed
 
@@ -225,25 +222,3 @@ def test_off_policy_monte_carlo_by_hand():
     # An action that the greedy policy would not have taken tells nothing of what came before.
     assert learn(0, 0, 0.25) == [[pytest.approx(2.625), 0], [0, 2.5]]
     np.testing.assert_allclose(sums, [[16 / 3, 0], [1, 2]], rtol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("name", "one_step", "own", "shared"),
-    [
-        ("n_step_sarsa", "sarsa", {"n_steps": 1}, {"exploration": "gaussian_noise"}),
-        ("n_step_tree_backup", "qlearning", {"n_steps": 1, "target_policy": "greedy"}, {}),
-        ("sarsa_lambda", "sarsa", {"trace_decay": 0.0, "trace_type": "dutch"}, {}),
-        ("q_lambda", "qlearning", {"trace_decay": 0.0, "trace_type": "replacing"}, {}),
-        ("dyna_q", "qlearning", {"planning_steps": 0}, {"learning_rate": "sample_average"}),
-    ],
-)
-def test_at_one_end_it_is_the_one_step_agent_to_the_bit(name, one_step, own, shared):
-    models = []
-    for each, settings_ in ((name, {**own, **shared}), (one_step, shared)):
-        env = make_vec_env("FrozenLake-v1", 3, seed=3)
-        models.append(load_algorithm(each)(env=env, seed=1, **settings_).learn(1500))
-    model, other = models
-    assert np.array_equal(model.policy.q_table, other.policy.q_table)
-    assert np.array_equal(model.policy.visit_counts, other.policy.visit_counts)
-    assert model.mean_td_error == other.mean_td_error
-    assert model.rng.bit_generator.state == other.rng.bit_generator.state

@@ -6,7 +6,6 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import FloatSchedule
 
-import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.mdp import TransitionModel, value_iteration

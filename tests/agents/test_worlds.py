@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents.compiled import worlds
 from rl_yardstick.agents.compiled.env_states import COMPENSATED_SUM
 from rl_yardstick.agents.compiled.loop import add_to_return, begin_episode, step

@@ -7,7 +7,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 
-import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
 from rl_yardstick.agents.common.schedules import ExponentialSchedule

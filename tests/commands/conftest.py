@@ -16,10 +16,9 @@ def pictures():
 
 
 @pytest.fixture(autouse=True)
-def no_pictures_elsewhere(request, monkeypatch):
-    """They take most of a short run."""
+def no_pictures_elsewhere(request):
     if "pictures" not in request.fixturenames:
-        monkeypatch.setattr("rl_yardstick.pipeline.training.draw", lambda *_: None)
+        request.getfixturevalue("quick_runs")
 
 
 @pytest.fixture

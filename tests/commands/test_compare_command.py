@@ -17,7 +17,6 @@ import pytest
 from filelock import FileLock
 from PIL import Image
 
-import rl_yardstick.envs  # noqa: F401
 from rl_yardstick.envs.bandits import log_uniformly
 from rl_yardstick.experiments.off_policy import difference_in_value
 from tests.pipeline.short_runs import trained
@@ -153,6 +152,7 @@ def states(study):
     return [json.loads(path.read_text())["state"] for path in study.glob("runs/*/*/run.json")]
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_the_same_command_does_what_is_left(number, typed, own_folder, begun):
     process, study = begun

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from rl_yardstick.diagnosis import target_probes
-from rl_yardstick.diagnosis.audit import audit
 from rl_yardstick.pipeline.settings import read_entry
 from rl_yardstick.report.documents import write_tables
 from tests.pipeline.short_runs import LAKE, trained
@@ -103,18 +101,6 @@ def test_a_script_of_ones_own(type_command, tmp_path):
     found = json.loads((tmp_path / "out.json").read_text())
     assert (found["verdict"], found["fault"]) == ("fault", "no-bootstrap-at-truncation")
     assert found["faults"][0]["source"].startswith("Pardo et al. (2018)")
-
-
-def test_a_class_of_ones_own(type_command, tmp_path, monkeypatch):
-    module = "rl_yardstick.agents.tabular.q_learning_and_sarsa"
-    text = f"from {module} import QLearning\n\nMine = QLearning\n"
-    (tmp_path / "my_audited_agents.py").write_text(text)
-    words = ("--engine", "interpreted")
-    few = (target_probes.probe_ends, target_probes.probe_discount)
-    monkeypatch.setattr(audit, "__defaults__", (few,))
-    code, out, err = type_command("audit", "--algo", "my_audited_agents:Mine", *words)
-    assert (code, err) == (0, "")
-    assert out.endswith("right, as far as these probes see\n")
 
 
 RETURN = "optimal policies return"

@@ -13,7 +13,6 @@ import zipfile
 import gymnasium as gym
 import pytest
 
-import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.envs.bandits import log_uniformly
 

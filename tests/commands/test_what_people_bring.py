@@ -93,22 +93,16 @@ def test_the_grid_world_of_gymnasium_is_solved(train, type_in_own_folder, own_fo
         assert any(terminated for _, _, terminated, *_ in walk)
 
 
-@pytest.mark.parametrize(("fault", "said"), STRANGE["tables"].items())
-def test_a_wrong_table_of_outcomes(train, fault, said):
-    code, out, err = train("Known", "--env-kwargs", f"fault:{fault}")
+def test_a_model_that_is_not_used_is_told(train):
+    code, out, err = train("Known")
     assert (code, err) == (0, ""), err
-    assert said in " ".join(out.split())
+    assert "has P, but not initial_state_distrib" in " ".join(out.split())
 
 
 def test_a_process_that_is_left_early_has_not_succeeded(train, own_folder):
-    study = ("compare.py", "--algos", "qlearning", "--seeds", "1", "--no-report")
-    for script, *words in (("train.py", "--algo", "qlearning"), study):
-        words += ["--env", "Leaves-v0", "-n", "200", "--gym-packages", "strange"]
-        env = {**os.environ, "PYTHONPATH": f"{own_folder}:{ROOT}"}
-        where = {"cwd": own_folder, "env": env, "capture_output": True, "text": True}
-        done = subprocess.run([sys.executable, ROOT / script, *words], check=False, **where)
-        assert done.returncode == 1, done.stderr
-    assert "failed: qlearning on Leaves-v0" in done.stdout
+    words = ["--algo", "qlearning", "--env", "Leaves-v0", "-n", "200", "--gym-packages", "strange"]
+    done = subprocess.run([sys.executable, ROOT / "train.py", *words], cwd=own_folder, check=False)
+    assert done.returncode == 1
 
 
 def test_an_exception_without_words_ends_the_run(train, own_folder):
@@ -167,25 +161,10 @@ from rl_yardstick import agents
 from rl_yardstick.agents.tabular.q_learning_and_sarsa import QLearning
 
 agents.register("mine", "own_agents:Mine", observations=["Discrete"])
-agents.register("plain", "own_agents:Plain", observations=["Discrete"])
 
 class Mine(QLearning):
     pass
-
-class Plain:
-    def act(self, obs):
-        return 0
-    def learn(self):
-        return self
 """
-
-
-def test_a_plain_class_is_told_what_it_lacks(type_in_own_folder, own_folder):
-    (own_folder / "own_agents.py").write_text(OWN)
-    words = ("--gym-packages", "own_agents", "--env", "FrozenLake-v1", "--algo", "plain", *SHORT)
-    code, _, err = type_in_own_folder("train.py", *words)
-    assert (code, err.splitlines()[1]) == (2, "the smallest class that works:")
-    assert "has learn(), which does not take (obs, action, reward, next_obs, terminated)" in err
 
 
 def test_runs_of_other_code_are_not_taken(type_in_own_folder, own_folder, in_this_process):
@@ -195,7 +174,7 @@ def test_runs_of_other_code_are_not_taken(type_in_own_folder, own_folder, in_thi
     for code in (OWN, OWN, OWN.replace("pass", "trait = 1")):
         (own_folder / "own_agents.py").write_text(code)
         answers.append(type_in_own_folder("compare.py", *words))
-        del sys.modules["own_agents"], ALGORITHMS["mine"], ALGORITHMS["plain"]
+        del sys.modules["own_agents"], ALGORITHMS["mine"]
     assert [code for code, *_ in answers] == [0, 0, 2]
     assert "1 runs, 1 of them there already" in answers[1][1]
     assert "1 finished run has other settings (code: " in answers[2][2]

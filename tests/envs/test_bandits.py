@@ -9,7 +9,6 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 
-import rl_yardstick.envs  # noqa: F401 (registers the environments)
 from rl_yardstick.envs import bandits
 from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.wrappers import ScaleReward

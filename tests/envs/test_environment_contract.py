@@ -17,7 +17,6 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import env_checker
 from gymnasium.wrappers import TimeLimit
 
-import rl_yardstick.envs  # noqa: F401 (registers the environments)
 from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs import wrappers as wrap
 from rl_yardstick.envs.mine_maze import MineMazeEnv

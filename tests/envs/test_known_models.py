@@ -9,7 +9,6 @@ from gymnasium.envs.classic_control import MountainCarEnv
 from gymnasium.utils.seeding import np_random
 from stable_baselines3.common.monitor import Monitor
 
-import rl_yardstick.envs  # noqa: F401 (registers the environments)
 import train
 from rl_yardstick.envs import brackets, wrappers
 from rl_yardstick.envs import known_models as known

@@ -36,12 +36,18 @@ class Careless(Corridor):
 
 
 SAME_REWARDS = outcomes(goal_reward=-1.0)
+# Thirds that do not sum to 1 in single precision.
+THIRDS = {
+    state: {a: [(np.float32(1) / 3, *rows[a][0][1:])] * 3 for a in rows}
+    for state, rows in SAME_REWARDS.items()
+}
 # Whether it draws bit for bit as toy_text does, and whether its state can be set.
 RIGHT = {
     "as toy_text": (Corridor, True, True),
     "other successors": (lambda: Backwards(SAME_REWARDS, SAME_REWARDS), False, True),
     "the global generators": (Careless, False, True),
     "deaf": (Deaf, True, False),
+    "thirds": (lambda: Corridor(THIRDS, THIRDS), True, True),
 }  # fmt: skip
 
 
@@ -95,8 +101,10 @@ FALSE = {
     "raises": (lambda: odd(step=raises), "against step, which raised RuntimeError: one two$"),
     "pair": (lambda: odd(observe=lambda env: (0, env.s)),
         r"the observation is \(0, 0\), not the number of a state"),
-    "a short outcome": (
-        lambda: Corridor({0: {0: [(1.0,)]}}), "the environment's P is no model"),
+    "a short outcome": (lambda: Corridor({0: {0: [(1.0,)]}}),
+        r"^the environment's P is no model: state 0, action 0: an outcome is \(probab"),
+    "by pairs": (lambda: Corridor({(s, 0): [] for s in range(5)}),
+        "P must map states, the numbers 0 to 4, to mappings of actions; it begins with"),
     "three actions": (lambda: odd(action_space=gym.spaces.Discrete(3)),
         r"P is no model: it has 2 actions, where the space is Discrete\(3\)$"),
 }  # fmt: skip

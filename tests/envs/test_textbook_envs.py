@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
-import rl_yardstick.envs  # noqa: F401 (registers the environments)
 from rl_yardstick import mdp
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.compiled.worlds import NotCompilable, compile_envs

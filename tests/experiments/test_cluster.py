@@ -29,7 +29,7 @@ def planned(root, n_seeds, **settings):
 
 
 def test_runs_of_a_worker_that_is_killed_are_done_again(tmp_path):
-    runs = planned(tmp_path, 2)
+    runs = planned(tmp_path, 1)
     root = tmp_path.absolute()
     with ClusterWorkers("local:1", 0, root) as workers:
 

@@ -86,25 +86,18 @@ def record(found, patterns):
     values, here = {name: (holds, value) for name, (holds, value, _) in found.items()}, facts()
     if patterns != ["*"] and GOLDEN.exists():  # those that were not looked at stay
         before = json.loads(GOLDEN.read_text(encoding="utf-8"))
-        if blocked(before["facts"]) & {holds for holds, _ in values.values()}:
+        if before["facts"] != here and "here" in {holds for holds, _ in values.values()}:
             raise SystemExit("the other entries are of another machine: record all, without --only")
         here = before["facts"]
         for where, entries in before["entries"].items():
             values |= {n: (where, v) for n, v in entries.items() if not matches(n, patterns)}
     entries = {
         where: {name: values[name][1] for name in sorted(values) if values[name][0] == where}
-        for where in ("anywhere", "python", "here")
+        for where in ("anywhere", "here")
     }
     text = json.dumps({"facts": here, "entries": entries}, indent=0, ensure_ascii=False)
     GOLDEN.write_text(f"{text}\n", encoding="utf-8")
     print(f"{GOLDEN.name}: {len(text) / 1000:.0f} kB")
-
-
-def blocked(recorded):
-    """Where entries hold that cannot be compared with recorded facts."""
-    now = facts()
-    python = {"python"} if now["python"] != recorded["python"] else set()
-    return python | ({"here"} if now != recorded else set())
 
 
 def matches(name, patterns):
@@ -116,7 +109,6 @@ def differences(recorded, found, patterns):
     """A line for each difference, and for each thing that cannot be compared here."""
     here = facts()
     changed_facts = [name for name, value in recorded["facts"].items() if here[name] != value]
-    incomparable = blocked(recorded["facts"])
     left = {name: value for name, (_, value, _) in found.items()}
     for where, entries in recorded["entries"].items():
         skipped = 0
@@ -124,7 +116,7 @@ def differences(recorded, found, patterns):
             if not matches(name, patterns):
                 continue
             lines = list(changes(name, was, left.pop(name, None)))
-            if where in incomparable and lines:
+            if where == "here" and changed_facts and lines:
                 skipped += 1
             else:
                 yield from lines

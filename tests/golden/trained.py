@@ -29,9 +29,7 @@ class Thing(NamedTuple):
     """Something that can be looked at."""
 
     name: str  # by which it is found again
-    # Where its value is the same: ``anywhere``, with the same ``python``, or ``here``: with the
-    # same processor and libraries.
-    holds: str
+    holds: str  # where its value is the same: ``anywhere``, or ``here``: on such a machine
     look: Callable[[], str | list[str]]  # says what it is, in a line or more
     needs: str = ""  # what the names of those things begin with that have to be done before
 

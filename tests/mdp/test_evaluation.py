@@ -29,12 +29,7 @@ def coin(end, reward=1.0):
     )
 
 
-def test_the_geometric_distribution_to_its_end_and_without_end():
-    found = mdp.policy_return(coin(0.2, reward=3), np.array([0]), None)
-    lengths, returns = (5, 0.8 / 0.04), (15, 9 * 0.8 / 0.04)
-    assert (found.expected_length, found.length_variance) == pytest.approx(lengths)
-    assert (found.expected_return, found.return_variance) == pytest.approx(returns)
-    assert found.success_rate is None
+def test_an_episode_without_end():
     found = mdp.policy_return(coin(0.5), np.array([1]), None, 0.9, np.ones((1, 2, 2), bool))
     assert found.expected_return == pytest.approx(10)
     assert found.return_variance == pytest.approx(0)

@@ -71,6 +71,14 @@ def test_a_potential_costs_nothing_and_is_found(data, model, discount, factor):
     assert rest[model.reachable] == pytest.approx(wanted[model.reachable], abs=1e-7)
 
 
+def assert_effect(found, returns, ours, theirs):
+    """Of the returns of all policies, and which of them are optimal before and after."""
+    assert found.optimum == pytest.approx(returns.max(), abs=1e-9)
+    ends = returns[theirs].max(), returns[theirs].min()
+    assert found.returns == pytest.approx(ends, abs=1e-9)
+    assert found.is_same == (ours == theirs).all()
+
+
 @settings(max_examples=30)
 @given(st.data(), models(states=3, actions=2), st.sampled_from(DISCOUNTS))
 def test_best_and_worst_are_those_of_all_optimal_policies(data, model, discount):
@@ -87,11 +95,7 @@ def test_best_and_worst_are_those_of_all_optimal_policies(data, model, discount)
         return (np.array(values) >= np.max(values, axis=0) - 1e-9).all(axis=1)
 
     returns = np.array([worth(model, p, None, discount) for p in policies])
-    ours, theirs = are_optimal(model.reward), are_optimal(shaped.reward)
-    assert found.optimum == pytest.approx(returns.max(), abs=1e-9)
-    ends = returns[theirs].max(), returns[theirs].min()
-    assert found.returns == pytest.approx(ends, abs=1e-9)
-    assert found.is_same == (ours == theirs).all()
+    assert_effect(found, returns, are_optimal(model.reward), are_optimal(shaped.reward))
     worst = worth(model, found.worst_policy, 4)
     assert worst == pytest.approx(found.judged[1], abs=1e-9)
 
@@ -107,11 +111,8 @@ def test_best_and_worst_under_a_limit_are_those_of_all_optimal_policies(data, mo
         np.array([worth(each, p, horizon) for p in policies]) for each in (model, shaped)
     )
     ours, theirs = returns >= returns.max() - 1e-9, others >= others.max() - 1e-9
-    assert found.optimum == pytest.approx(returns.max(), abs=1e-9)
-    ends = returns[theirs].max(), returns[theirs].min()
-    assert found.returns == pytest.approx(ends, abs=1e-9)
-    assert found.is_same == (ours == theirs).all()
-    for policy, value in ((found.policy, found.optimum), (found.worst_policy, ends[1])):
+    assert_effect(found, returns, ours, theirs)
+    for policy, value in ((found.policy, found.optimum), (found.worst_policy, found.returns[1])):
         assert worth(model, policy, horizon) == pytest.approx(value, abs=1e-9)
 
 

@@ -162,14 +162,11 @@ class Copy:
         if digest() == before.name or not fresh:
             shutil.copytree(before, code / "yardstick" / digest(), copy_function=os.link)
 
-    def judge(self, mutant: Mutant, first: str | None) -> str:
-        """The test that catches an error, or another fate; a test that did so before goes first."""
+    def judge(self, mutant: Mutant) -> str:
+        """The test that catches an error, or another fate."""
         file = self.path / mutant.path
-        source = file.read_text() if file.exists() else ""
-        if mutant.place(source) is None:
-            return "source changed"
+        source = file.read_text()
         tests, fresh = self._likely(mutant, source)
-        tests.sort(key=lambda test: test != first)
         totals = [*accumulate(self.costs[test] for test in tests)]
         few, many = (1 + sum(total < limit for total in totals) for limit in (FIRST, BUDGET))
         # Byte code may be as old as its source, to the second: none is kept of this file.
@@ -180,10 +177,7 @@ class Copy:
             for chosen in filter(None, (tests[:few], tests[few:many])):
                 files = list(dict.fromkeys(test.split("::")[0] for test in chosen))
                 chosen.sort(key=lambda test, files=files: files.index(test.split("::")[0]))
-                failure = self.run(chosen, fresh)
-                if failure == "pytest's code 4":  # the names of tests may have changed
-                    failure = self.run(files, fresh)
-                if failure:
+                if failure := self.run(chosen, fresh):
                     return failure
         finally:
             file.write_text(source)
@@ -196,9 +190,8 @@ class Copy:
         Compiled functions leave no trace. Nor does a fixture of several tests but in the first: so
         after the tests that enter the function come the others of their files.
         """
-        line, stem = source.count("\n", 0, mutant.place(source)) + 1, Path(mutant.path).stem
         functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
-        around = [node for node in functions if node.lineno <= line <= node.end_lineno]
+        around = [node for node in functions if node.lineno <= mutant.line <= node.end_lineno]
         parts = [part.lineno for node in around[-1:] for part in (node, *node.decorator_list)]
         covering = self.entering[f"{mutant.path}:{min(parts, default=0)}"]
         places = [place for place in self.entering if place.startswith(f"{mutant.path}:")]
@@ -208,43 +201,31 @@ class Copy:
 
         def rank(test: str) -> tuple[bool, bool, bool, bool, float]:
             file = test.partition("::")[0]
-            is_far = file not in files, stem not in file, not test.startswith(own)
+            is_far = file not in files, Path(mutant.path).stem not in file, not test.startswith(own)
             return test not in covering, *is_far, self.costs[test]
 
         return sorted(self.costs, key=rank), not covering
 
 
 def main() -> None:
-    """Draw errors, or take those drawn before; judge each, and count."""
+    """Draw errors, judge each, and count."""
     root = Path(__file__).resolve().parents[2]
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("packages", nargs="+", help="folders of sources, such as rl_yardstick/mdp")
     parser.add_argument("-n", type=int, default=25, help="how many errors in each (25)")
     parser.add_argument("--seed", type=int, default=0, help="which errors (0)")
-    parser.add_argument("--record", type=Path, help="write the errors and their fates to a file")
-    parser.add_argument("--replay", type=Path, help="make the errors of such a file again")
-    parser.add_argument("--root", type=Path, default=root, help="another checkout than this one")
-    args = parser.parse_args()
-    root, entries = args.root.resolve(), []
-    replayed = json.loads(args.replay.read_text()) if args.replay else []
+    args, fates = parser.parse_args(), []
     os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
-    for name in LIBRARIES.split() if (root / "constraints.txt").exists() else ():
-        with contextlib.suppress(ImportError):
-            importlib.import_module(name)
+    for name in LIBRARIES.split():
+        importlib.import_module(name)
     copy = Copy(root)
     for test in copy.broken:
         print(f"left out, as it fails without any error: {test}", file=sys.stderr)
     for package in args.packages:
-        known = {Mutant(*m): fate for *m, fate in replayed if m[0].startswith(f"{package}/")}
-        mutants = known if args.replay else drawn(root, package, args.n, args.seed)
-        for mutant in mutants:
-            fate = copy.judge(mutant, known.get(mutant))
-            entries.append([*mutant, fate])
+        for mutant in drawn(root, package, args.n, args.seed):
+            fates.append(copy.judge(mutant))
             was, now = (" ".join(text.split())[:90] for text in (mutant.old, mutant.new))
-            print(f"{mutant.path}:{mutant.line}: {was}  ->  {now}\n    {fate}", flush=True)
-            if args.record:
-                args.record.write_text(json.dumps(entries, indent=1) + "\n")
-    fates = [fate for *_, fate in entries if fate != "source changed"]
+            print(f"{mutant.path}:{mutant.line}: {was}  ->  {now}\n    {fates[-1]}", flush=True)
     print(f"caught {len(fates) - fates.count('survived')} of {len(fates)}")
 
 

@@ -27,18 +27,12 @@ class Mutant(NamedTuple):
     """One error: what some lines of a file are, and what becomes of them."""
 
     path: str  # from the root of the checkout
-    line: int  # the first of them, when it was drawn
+    line: int  # the first of them
     old: str
     new: str
 
-    def place(self, source: str) -> int | None:
-        """Where these lines begin, nearest to where they were; None if they have changed."""
-        found = re.finditer(f"^{re.escape(self.old)}$", source, re.MULTILINE)
-        at = [match.start() for match in found]
-        return min(at, key=lambda i: abs(source.count("\n", 0, i) + 1 - self.line), default=None)
-
     def applied_to(self, source: str) -> str:
-        at = self.place(source)
+        at = sum(map(len, source.splitlines(keepends=True)[: self.line - 1]))
         return source[:at] + self.new + source[at + len(self.old) :]
 
 

@@ -10,7 +10,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from rl_yardstick.agents import load_algorithm, policies
 from rl_yardstick.agents.policies import policy_matrix
-from rl_yardstick.mdp import policy_return, value_iteration
+from rl_yardstick.mdp import value_iteration
 from rl_yardstick.pipeline.environments import make_envs, make_training_env
 from rl_yardstick.pipeline.evaluation import judge
 from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
@@ -174,33 +174,8 @@ def test_an_agent_that_has_learnt_something_else_is_evaluated_anew():
     assert evaluator.values(evaluator.policy(agent, True))[0] != values[0]
 
 
-def on_a_small_lake(name, **arguments):
-    """An evaluator, and an agent that has learned for a while."""
-    limited = {"max_episode_steps": 12, "is_slippery": False, "desc": ["SF", "FG"]}
-    spec = spec_of("qlearning", LAKE, {"env_kwargs": limited})
-    env = make_training_env(spec, None)
-    agent = agent_of(name, env, engine="interpreted", **arguments).learn(400)
-    return exact_evaluator(spec), agent
-
-
-def test_the_worth_of_exploring():
-    """With as many states as actions, rows can be mistaken for columns."""
-    evaluator, agent = on_a_small_lake("sarsa", exploration="boltzmann", temperature=0.3)
-    found = evaluator(agent, deterministic=False)
-    chances = np.exp(agent.policy.q_table / 0.3)
-    chances /= chances.sum(axis=1, keepdims=True)
-    expected = policy_return(evaluator.model, chances, 12)
-    assert found.mean_return == pytest.approx(expected.expected_return, abs=1e-12)
-    assert found.lengths[0] == pytest.approx(expected.expected_length, abs=1e-12)
-    others = evaluator.other_returns(agent)
-    assert others.acts_by == "temperature 0.3"
-    assert others.stochastic_return == pytest.approx(found.mean_return)
-    # It has learnt something, and exploring costs some of it.
-    assert 0.05 < found.mean_return < evaluator(agent).mean_return
-
-
 def test_what_is_not_known_is_not_guessed():
-    evaluator, agent = on_a_small_lake("qlearning", exploration="gaussian_noise")
+    evaluator, agent = known(LAKE), agent_of("qlearning", LAKE, exploration="gaussian_noise")
     with pytest.raises(ValueError, match="no closed-form action probabilities"):
         evaluator(agent, deterministic=False)
     assert evaluator.other_returns(agent).stochastic_return is None

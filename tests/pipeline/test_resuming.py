@@ -57,10 +57,9 @@ TRAININGS = [
 
 
 @pytest.fixture(autouse=True)
-def quick_states(monkeypatch, tmp_path):
-    """A state at each safe moment, and evaluations that a test can wait for."""
+def quick_states(monkeypatch, tmp_path, quick_runs):
+    """A state at each safe moment."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 200)
     monkeypatch.setattr(StateCallback, "share_of_time", 1e9)
     monkeypatch.setattr(StateCallback, "shortest_pause", 0.0)
 

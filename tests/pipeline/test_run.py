@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from rl_yardstick.pipeline import files
 from rl_yardstick.pipeline.callbacks import EvaluationCallback
 from rl_yardstick.pipeline.errors import Stopped, UserError
-from rl_yardstick.pipeline.evaluation import sampled
 from rl_yardstick.pipeline.files import (
     json_text,
     portable_name,
@@ -34,9 +33,8 @@ from tests.pipeline.short_runs import CART, LAKE, TABLES, run_of, spec_of, train
 
 
 @pytest.fixture(autouse=True)
-def own_place(tmp_path, monkeypatch):
+def own_place(tmp_path, monkeypatch, quick_runs):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 200)
 
 
 def test_numbers_are_given_once_and_the_newest_is_last():

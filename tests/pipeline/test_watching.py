@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.pipeline import callbacks, watching
 from rl_yardstick.pipeline.callbacks import ProgressCallback

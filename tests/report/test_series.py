@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 from scipy import integrate
 
-import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.bandits import pull_statistics
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec

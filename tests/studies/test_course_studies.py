@@ -2,8 +2,7 @@
 
 Figures of the course material were measured with programs written after the course's own code, over
 the number of seeds named beside them. A mean over our seeds must lie within four standard errors of
-theirs, both samples counted, unless said otherwise. Five rows of the warehouse are compared in
-``tests/agents/test_known_results.py`` already.
+theirs, both samples counted, unless said otherwise.
 """
 
 import math
