@@ -186,7 +186,7 @@ def judge(
         paths = what if isinstance(what, list | tuple) else [what]
         if isinstance(what, pd.DataFrame):
             paths = [Path(folder) / "table.csv"]
-            what.to_csv(paths[0], index=False)
+            what.to_csv(paths[0], index=any(what.index.names))
         own = [f"{name}={column}" for name, column in (columns or {}).items()]
         words = [*map(str, paths), *(["--columns", *own] if own else [])]
         args = _flags(compare_command, env, [], settings, words)
