@@ -130,7 +130,7 @@ def results_of(
     for agent, env in dict.fromkeys(labels):
         own, scale = {"agent": agent, "env": env}, places[env][1]
         finals: Any = pd.Series([log.figures[kind] for log in logs if log.labels == own])
-        if scale and scale.score(finals.mean() - 6 * finals.sem()) > 1 + MARGIN:
+        if scale and finals.mean() - 6 * finals.sem() > scale.optimum + MARGIN * abs(scale.optimum):
             above = f"{env}: returns of {agent} above the optimum {scale.optimum:.4g}"
             notes.append(f"{above}: another environment or other arguments; --env-kwargs")
             places[env] = _place("", (), options)

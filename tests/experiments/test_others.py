@@ -282,6 +282,10 @@ def test_what_is_assumed_is_told(tmp_path):
     twice = pd.concat([table(lr=0.1), table(lr=0.5)]).set_index(["agent", "seed"])
     columns = "has up to 2 rows for each agent, seed: averaged (other columns: lr)"
     assert columns in told(judge(twice))
+    lengths = lengths_table().drop(columns="episode")
+    assert "up to 120 rows for each agent, seed: averaged (other columns: steps)" in told(
+        judge(lengths)
+    )
     rows = [
         (a, "X", s, n, s) for a, most in (("a", 20), ("b", 30)) for s in (0, 1) for n in (10, most)
     ]
@@ -307,6 +311,23 @@ def test_rows_that_are_no_episodes_are_named(tmp_path):
     (log,), (note,) = find_logs([tmp_path], {})
     assert note.endswith("skipped 3 of 123 rows, no episodes: lines 12, 124, 125")
     assert log.figures == {"training": 3.0}
+
+
+def test_runs_without_the_figure_of_most_runs_are_counted(tmp_path):
+    """Of six runs one has no evaluations, another only NaN; a third has no episode at all."""
+    for seed in range(1, 7):
+        folder = tmp_path / "ppo" / str(seed)
+        folder.mkdir(parents=True)
+        old_monitor(folder, 3.0)
+        results = np.full((2, 5), np.nan if seed == 2 else float(seed))
+        if seed > 1:
+            np.savez(folder / "evaluations.npz", timesteps=[50, 100], results=results)
+    (tmp_path / "ppo" / "7").mkdir()
+    (tmp_path / "ppo" / "7" / "monitor.csv").write_text('#{"t_start": 1, "env_id": "None"}\n')
+    found = judge(tmp_path)
+    assert found.runs["final"].tolist() == [3.0, 4.0, 5.0, 6.0]
+    assert set(found.runs["environment"]) == {"environment"}
+    assert "mean return in the last evaluation left out: 3 runs without" in told(found)
 
 
 def test_labels_belong_to_one_run(tmp_path):
