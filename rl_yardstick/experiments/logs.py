@@ -254,7 +254,7 @@ def table_logs(
     if "seed" not in names:
         seed = falls.groupby(by).cumsum().astype("string")
         if seed.nunique() > 1:
-            by, given = [*by, seed], [*given, "seed"]
+            by, given = [*by[: len(given)], seed], [*given, "seed"]
             taken = "each row" if step is None else f"each part, to where {step!r} falls,"
             notes.append(f"{path} has no column of seeds: {taken} counts as a seed")
     elif falls.mean() > 0.1 and pd.concat([*by, steps], axis=1).duplicated().any():

@@ -275,6 +275,7 @@ def test_what_is_assumed_is_told(tmp_path):
     assert found.table["n"].tolist() == [6, 6]
     assert "no column of seeds: each part, to where 'global_step' falls," in told(found)
     assert "each row counts as a seed" in told(judge(table().drop(columns="seed")))
+    assert judge(table()[["score"]]).table["n"].tolist() == [len(FIGURES)]
     assert "one agent only, good" in told(judge(table().query("agent == 'good'")))
     assert "no log names its environment: --env gives it" in told(found)
     figures = FIGURES | {("good", 3): float("nan")}
