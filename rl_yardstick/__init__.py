@@ -4,7 +4,10 @@ from importlib import import_module
 from typing import Any
 
 _OF_API = ("Run", "Study", "audit", "compare", "explain", "judge", "optimum", "train", "tune")
-_HOMES = dict.fromkeys(_OF_API, "api") | {"rate": "rating.ratings"}
+_HOMES = dict.fromkeys(_OF_API, "api") | {
+    "rate": "rating.ratings",
+    "UserError": "pipeline.errors",
+}
 __all__ = list(_HOMES)
 
 

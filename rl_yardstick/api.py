@@ -186,7 +186,7 @@ def judge(
         paths = what if isinstance(what, list | tuple) else [what]
         if isinstance(what, pd.DataFrame):
             paths = [Path(folder) / "table.csv"]
-            what.to_csv(paths[0], index=False)
+            what.to_csv(paths[0], index=any(what.index.names))
         args = _flags(compare_command, env, [], settings, [*map(str, paths)])
         args.columns = dict(columns or {})
         console = TextConsole(file=text, width=100, **_PLAIN)

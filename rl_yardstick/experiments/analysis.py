@@ -243,7 +243,7 @@ class AgentAnalysis:
     last_episodes: Estimate  #: mean return of the last training episodes
     regret: Estimate  #: on bandits, the sum over all pulls; else NaN
     #: Steps until the learning curve first reached the threshold, steps and episodes until it
-    #: reached the threshold for good; None without a threshold.
+    #: reached the threshold for good; None without a threshold or curves.
     steps_to_threshold: ThresholdSummary | None
     steps_to_stay: ThresholdSummary | None
     episodes_to_stay: ThresholdSummary | None
@@ -375,8 +375,8 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         return mean_over_runs(values(column), bounds)
 
     def steps(column: str) -> ThresholdSummary | None:
-        has_threshold = table["threshold"].notna().any()
-        return summarise_steps(values(column)) if has_threshold else None
+        found = summarise_steps(values(column))
+        return found if found.median.n else None
 
     def known(column: str, bounds: Bounds = UNBOUNDED) -> Estimate | None:
         return mean(column, bounds) if table[column].notna().any() else None

@@ -21,25 +21,26 @@ import pandas as pd
 from rl_yardstick.experiments.results import LAST_EPISODES as LAST
 from rl_yardstick.experiments.results import MAX_TABLE, Episodes, joined_episodes, read_evaluations
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.errors import UserError, one_line, unknown
+from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
 from rl_yardstick.pipeline.files import read_bytes
 from rl_yardstick.pipeline.run import RECORD, Run
 from rl_yardstick.pipeline.settings import read_saved
 
 # The kinds of final figures, the best first; those of tables are named as their columns.
-FINAL, EVALUATION, TRAINING = "final", "evaluation", "training"
+FINAL, EVALUATION, TRAINING, SAMPLED = "final", "evaluation", "training", "sampled"
 WORDS = {
     FINAL: "return of the final policy",
     EVALUATION: "return in the last evaluation",
     TRAINING: f"return of the last {LAST} training episodes",
+    SAMPLED: "return in the last tenth of the logged points of training",
 }
 # The usual names of columns, in small letters, without what stands before a slash; best first.
 NAMES = {
     "agent": "agent algo algorithm method agent_name algo_name name model",
     "env": "env environment env_id env_name task game",
     "seed": "seed run trial run_id n_simu simulation repetition",
-    "step": "global_step total_timesteps timesteps_total timesteps timestep num_timesteps steps "
-    "step episode iteration epoch",
+    "step": "episode global_step total_timesteps timesteps_total timesteps timestep num_timesteps "
+    "steps step iteration epoch",
     "score": "score final_score final_return mean_return mean_reward ep_rew_mean eprewmean "
     "episode_reward_mean avg_episodic_return episodic_return episode_return episode_reward "
     "episode_rewards average_return average_reward total_reward return returns eval_rewards reward "
@@ -69,16 +70,20 @@ class Log:
     episodes: Episodes = NOTHING  #: those of training
     monitors: list[Floats] = field(default_factory=list)  #: those in each of Monitor's files
 
-    def add(self, name: str, steps: Any, values: Any) -> None:
+    def add(self, name: str, steps: Any, values: Any, axis: str = "") -> None:
         """Add the curve in a column, and its final figure, unless there is one of this kind."""
         rows = np.column_stack([steps, values]).astype(np.float64)
         rows = rows[np.isfinite(rows).all(axis=1)]
         steps, values = rows[np.argsort(rows[:, 0], kind="stable")].T
-        kind, n = kind_of(name), LAST if _short(name) in OF_EPISODES else 1
+        is_every = len(steps) > 0 and np.ptp(steps) < 2 * len(steps)  # else a sample of episodes
+        name = "r" if is_every and axis == "episode" and kind_of(name) == name else name
+        kind, n = kind_of(name), 1
+        if _short(name) in OF_EPISODES and (is_every or kind == TRAINING):
+            kind, n = (kind, LAST) if is_every else (SAMPLED, max(1, len(values) // 10))
         if len(values) and kind not in self.figures:
             self.figures[kind] = float(values[-n:].mean())
             line = Episodes(steps, values, np.zeros(len(steps)))
-            if kind == TRAINING:
+            if kind in (TRAINING, SAMPLED):
                 self.episodes = line
             elif kind == EVALUATION or not len(self.evaluations.steps):
                 self.evaluations = line
@@ -107,11 +112,11 @@ def find_logs(paths: Sequence[Path], columns: Mapping[str, str]) -> tuple[list[L
                 logs += _read_file(place / name, run, columns, notes)
             except (UserError, OSError) as error:
                 skipped.append(one_line(error))
-        if run.figures:
+        if any(map(_OF_RUN.fullmatch, names)):
             logs.append(run)
             with suppress(UserError, OSError):
                 _add_settings(run)
-    if not logs:
+    if not any(log.figures for log in logs):
         kinds = "monitor.csv, evaluations.npz, progress.csv, event files or tables as .csv"
         raise UserError("; ".join([f"no logs in {paths[0]}: give {kinds}", *skipped[:1]]))
     if n := len(skipped):
@@ -158,7 +163,7 @@ def _add_monitor(log: Log, path: Path, notes: list[str]) -> None:
     text = read_bytes(path, MAX_TABLE).decode(errors="replace")
     lines = pd.Series(text.splitlines(), dtype=str)
     is_comment = lines.str.startswith("#")  # settings as JSON
-    ids = re.findall(r'"env_id": *"([^"]+)"', " ".join(lines[is_comment]))
+    ids = re.findall(r'"env_id": *"(?!None")([^"]+)"', " ".join(lines[is_comment]))
     log.env = log.env or "".join(ids[:1])
     lines = lines[~is_comment & (lines.str.strip() != "")]
     is_whole = lines.str.count(",") == lines.str.count(",")[:1].sum()
@@ -230,7 +235,7 @@ def table_logs(
     if {"tag", "value"} <= {*table.columns}:  # as rlberry exports: a column for each tag
         tags = returns_in(map(str, table["tag"].unique()))
         values = {tag: table["value"].where(table["tag"] == tag) for tag in tags}
-        table = table.drop(columns=["tag", "value"]).assign(**values)
+        table = table.assign(**values)[table["tag"].isin(tags)].drop(columns=["tag", "value"])
     if charts := _chart_logs(table, path):
         return charts
     names = _named_columns(table, columns, path)
@@ -238,17 +243,26 @@ def table_logs(
     if not scores:
         held = ", ".join(table.columns[:8])
         raise UserError(f"{path} has no known column of returns ({held}): --columns score=NAME")
-    table = table[table[scores].apply(pd.to_numeric, errors="coerce").notna().any(axis=1)]
+    if not table[scores].apply(pd.to_numeric, errors="coerce").notna().any(axis=None):
+        held = shown([*table[scores[0]][:1]])
+        raise UserError(f"{path}: column {scores[0]} holds no numbers: {held}")
     step, given = names.get("step"), [key for key in ("agent", "env", "seed") if key in names]
-    by = [table[names[key]] for key in given] or [pd.Series(0, table.index)]
+    by = [table[names[key]].astype("string").str.strip() for key in given]
+    by = by or [pd.Series("", table.index)]
+    steps = table[step] if step else pd.Series(range(0, -len(table), -1), table.index)
+    falls = pd.to_numeric(steps, errors="coerce").groupby(by).diff() < 0
     if "seed" not in names:
-        steps = None if step is None else pd.to_numeric(table[step], errors="coerce")
-        begins = pd.Series(True, table.index) if steps is None else steps.groupby(by).diff() < 0
-        seed = begins.groupby(by).cumsum()
+        seed = falls.groupby(by).cumsum().astype("string")
         if seed.nunique() > 1:
-            by, given = [*by, seed], [*given, "seed"]
+            by, given = [*by[: len(given)], seed], [*given, "seed"]
             taken = "each row" if step is None else f"each part, to where {step!r} falls,"
             notes.append(f"{path} has no column of seeds: {taken} counts as a seed")
+    elif falls.mean() > 0.1 and pd.concat([*by, steps], axis=1).duplicated().any():
+        step = None  # the lengths of episodes, say
+    if not step and (n := table.groupby(by).size().max()) > 1 and kind_of(scores[0]) != TRAINING:
+        others = table.columns.drop([*scores, *(names[key] for key in given)])[:5]
+        which = f"averaged (other columns: {', '.join(others) or 'none'})"
+        notes.append(f"{path} has up to {n:,} rows for each {', '.join(given)}: {which}")
     logs = []
     for of, rows in table.groupby(by, sort=False):
         texts = [re.sub(r"\.0$", "", str(value)) for value in of][: len(given)]
@@ -276,13 +290,12 @@ def _add_columns(log: Log, rows: pd.DataFrame, step: str | None, scores: Sequenc
     for name in scores:
         values = pd.to_numeric(rows[name], errors="coerce").to_numpy(np.float64)
         if step is not None:
-            is_of_episodes = _short(step) == "episode" and kind_of(name) == name
-            steps = pd.to_numeric(rows[step], errors="coerce")
-            log.add("r" if is_of_episodes else name, steps, values)
+            log.add(name, pd.to_numeric(rows[step], errors="coerce"), values, _short(step))
         elif len(rows) > 1 and _short(name) in OF_EPISODES:
             log.add(name, np.arange(1, len(values) + 1), values)
         elif np.isfinite(values).any():
-            log.figures.setdefault(kind_of(name), float(np.nanmean(values)))
+            kind = kind_of(name) if kind_of(name) == EVALUATION else name
+            log.figures.setdefault(kind, float(np.nanmean(values)))
 
 
 def _chart_logs(table: pd.DataFrame, path: Path) -> list[Log]:

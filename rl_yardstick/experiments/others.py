@@ -14,7 +14,8 @@ from typing import Any
 import gymnasium as gym
 import pandas as pd
 
-from rl_yardstick.experiments.logs import WORDS, Log
+from rl_yardstick.experiments.analysis import MARGIN
+from rl_yardstick.experiments.logs import TRAINING, WORDS, Log
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.results import (
     HIDDEN_COLUMNS,
@@ -33,8 +34,9 @@ from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 from rl_yardstick.pipeline.spec import TrainSpec, validated
 
-# Regular expressions of labels in paths: of ids of Gymnasium, and of seeds with a word before them.
-FORMS = {"agent": "[^/]+?", "env": r"[A-Za-z0-9.-]+-v\d+", "seed": r"(?:(?:seed|run|s)[-_=]?)?\d+"}
+# Regular expressions of labels in paths: ids of Gymnasium; seeds: numbers behind a word, or dates.
+SEED = r"(?:(?:seed|run|s)[-_= ]?)?\d+|\d{4}-?\d\d-?\d\d[-_T ]\d[\d.:-]*"
+FORMS = {"agent": "[^/]+?", "env": r"[A-Za-z0-9.-]+-v\d+", "seed": SEED}
 # The first that fits the end of a path is taken.
 PATTERNS = (
     *("{agent}/{env}_{seed}", "{agent}/{env}/{seed}", "{env}/{agent}/{seed}"),
@@ -109,10 +111,10 @@ def results_of(
     Raises:
         UserError: if labels are missing, or are those of two runs.
     """
-    every = _labelled(every, notes, options)
-    counts = Counter(kind for log in every for kind in log.figures)
-    kind = max([*WORDS, *counts], key=lambda kind: counts[kind])  # the first that most runs have
-    logs = [log for log in every if kind in log.figures]
+    counts, half = Counter(kind for log in every for kind in log.figures), len(every) // 2
+    # The first that more than half of the runs have, or else most.
+    kind = max([*WORDS, *counts], key=lambda kind: min(counts[kind], half + 1))
+    logs = _labelled([log for log in every if kind in log.figures], notes, options)
     is_last = any(len(log.evaluations.steps) for log in logs)
     words = WORDS.get(kind) or f"{'last ' if is_last else ''}{kind}"
     notes.append(f"figure of each run: {'mean ' if kind in WORDS else ''}{words}")
@@ -122,7 +124,16 @@ def results_of(
     agents = list(dict.fromkeys(agent for agent, _ in labels))
     if len(agents) == 1:
         notes.append(f"one agent only, {agents[0]}: a comparison needs two")
+    if Options.env in (env for _, env in labels):
+        notes.append("no log names its environment: --env gives it")
     places = {env: _place(env, logs, options) for env in dict.fromkeys(env for _, env in labels)}
+    for agent, env in dict.fromkeys(labels):
+        own, scale = {"agent": agent, "env": env}, places[env][1]
+        finals: Any = pd.Series([log.figures[kind] for log in logs if log.labels == own])
+        if scale and finals.mean() - 6 * finals.sem() > scale.optimum + MARGIN * abs(scale.optimum):
+            above = f"{env}: returns of {agent} above the optimum {scale.optimum:.4g}"
+            notes.append(f"{above}: another environment or other arguments; --env-kwargs")
+            places[env] = _place("", (), options)
     seeds = [labels[:k].count(one) for k, one in enumerate(labels)]
     study = StudySpec(
         name=root.name,
@@ -145,10 +156,10 @@ def results_of(
     hidden = HIDDEN_COLUMNS if any(row["full_optimum"] is not None for row in rows) else ()
     table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *hidden])
     for name, of_env in table.dropna(subset="n_timesteps").groupby("environment"):
-        steps = of_env.groupby("agent")["n_timesteps"].median()
-        if steps.max() > 1.1 * steps.min():
-            span = f"{steps.min():,.0f} to {steps.max():,.0f} steps"
-            notes.append(f"{name}: agents trained for {span}")
+        ends = of_env.set_index("agent")["n_timesteps"].sort_values()
+        if ends.iloc[-1] > 1.1 * ends.iloc[0]:
+            first, last = (f"{ends.iloc[k]:,.0f} ({ends.index[k]})" for k in (0, -1))
+            notes.append(f"{name}: the shortest run ends at {first}, the longest at {last}")
     return StudyResults(study, root, table, joined(curves), tuple(planned))
 
 
@@ -188,4 +199,5 @@ def _read(
     curve = evaluation_curve(run, episodes, evaluated.steps, evaluated.returns)
     row = summary_row(study, run, recorded, episodes, curve)
     row |= {"agent": run.agent, "environment": run.environment, "path": log.place}
-    return {**row, "env_id": run.spec.env_id}, curve, training_curve(run, episodes)
+    row |= {"env_id": run.spec.env_id, "last_episodes": log.figures.get(TRAINING)}
+    return row, curve, training_curve(run, episodes)

@@ -122,8 +122,15 @@ def events(folder, value):
     progress(folder, value, "tensorboard")
 
 
+def sampled(folder, value):
+    """Of thousands of episodes: of 21 points the last two count."""
+    rows = [(500 * k, value + (k - 19.5 if k > 18 else -k)) for k in range(21)]
+    made = pd.DataFrame(rows, columns=["global_step", "charts/episodic_return"])
+    made.to_csv(folder / "progress.csv", index=False)
+
+
 @pytest.mark.parametrize(
-    "write", [monitors, old_monitor, damaged_monitor, evaluations, progress, events]
+    "write", [monitors, old_monitor, damaged_monitor, evaluations, progress, events, sampled]
 )
 def test_run_folders_are_judged_as_their_numbers_are(tmp_path, write):
     for (agent, seed), value in FIGURES.items():
@@ -131,9 +138,12 @@ def test_run_folders_are_judged_as_their_numbers_are(tmp_path, write):
         folder.mkdir(parents=True)
         write(folder, value)
     results = results_of(*find_logs([tmp_path], {}), Options(), tmp_path)
+    shown = [*FIGURES.values()] if write not in (evaluations, sampled) else [None] * len(FIGURES)
+    assert [*results.summary["last_episodes"].replace(np.nan, None)] == shown
     curves = learning_curves(results, analyse(results).environments[0])
     assert {one.budget for one in curves.values()} == {"step"}
-    check(judge(tmp_path), "last evaluation" if write is evaluations else "last 100 training")
+    words = {evaluations: "last evaluation", sampled: "mean return in the last tenth of the logged"}
+    check(judge(tmp_path), words.get(write, "last 100 training"))
 
 
 def check(found, words):
@@ -162,6 +172,12 @@ def episodes_table():
     )
 
 
+def lengths_table():
+    """The length of each episode is no axis."""
+    rows = episodes_table().rename(columns={"Return": "reward"})
+    return rows.assign(steps=200 - rows["reward"] - rows["episode"] % 3)
+
+
 def of_rlberry():
     long = curves("value").rename(columns={"algo": "name", "run": "n_simu"})
     times = long.assign(tag="dw_time_elapsed", value=7.0)
@@ -185,6 +201,8 @@ def of_wandb():
         (curves("eval/mean_reward"), "last evaluation"),
         (curves("rollout/ep_rew_mean"), "last 100 training"),
         (episodes_table(), "last 100 training"),
+        (lengths_table(), "last 100 training"),
+        (table().rename(columns={"score": "charts/episodic_return"}), "charts/episodic_return"),
         (of_rlberry(), "last evaluation"),
         (of_wandb(), "last 100 training"),
     ],
@@ -208,6 +226,9 @@ def test_columns_are_those_that_are_named(tmp_path):
         judge(made)
     with pytest.raises(UserError, match="no column 'whom': did you mean 'who'"):
         judge(made, columns={"agent": "whom"})
+    for wrong in (made[:0], made.astype({"points": str}).replace(r"\.", ",", regex=True)):
+        with pytest.raises(UserError, match="column points holds no numbers"):
+            judge(wrong, columns={"agent": "who", "score": "points"})
     with pytest.raises(UserError, match="judge has no setting 'margins'"):
         judge(made, margins=1)
 
@@ -222,6 +243,11 @@ def test_scores_are_on_the_scale_where_the_environment_is_known():
     scores = [(mean - baseline) / (1 - baseline) for mean in means]
     assert found.table["mean"].tolist() == pytest.approx(scores)
     assert judge(table(figures, env="OtherLake-v1")).runs["optimum"].isna().all()
+    figures = {key: 0.809 if "poor" in key else 1.0 for key in FIGURES}
+    slippery = judge(table(figures, env="FrozenLake-v1"))
+    assert "returns of good above the optimum 0.7442" in told(slippery)
+    assert slippery.runs["optimum"].isna().all()
+    assert slippery.verdicts["verdict"].tolist() == ["better"]
 
 
 @pytest.mark.parametrize(
@@ -233,6 +259,8 @@ def test_scores_are_on_the_scale_where_the_environment_is_known():
         ("res/LunarLander-v3/sac_s2", ("sac", "LunarLander-v3", "s2")),
         ("res/my_agent_CartPole-v1_0", ("my_agent", "CartPole-v1", "0")),
         ("tb/PPO_1", ("PPO", None, "1")),
+        ("my runs/base line/run 1", ("base line", None, "run 1")),
+        ("q/2026-01-01_12-30-00", ("q", None, "2026-01-01_12-30-00")),
         ("out/mine", ("mine", None, None)),
     ],
 )
@@ -247,12 +275,23 @@ def test_what_is_assumed_is_told(tmp_path):
     assert found.table["n"].tolist() == [6, 6]
     assert "no column of seeds: each part, to where 'global_step' falls," in told(found)
     assert "each row counts as a seed" in told(judge(table().drop(columns="seed")))
+    assert judge(table()[["score"]]).table["n"].tolist() == [len(FIGURES)]
     assert "one agent only, good" in told(judge(table().query("agent == 'good'")))
+    assert "no log names its environment: --env gives it" in told(found)
+    figures = FIGURES | {("good", 3): float("nan")}
+    assert "left out: 1 run without such a figure" in told(judge(table(figures)))
+    twice = pd.concat([table(lr=0.1), table(lr=0.5)]).set_index(["agent", "seed"])
+    columns = "has up to 2 rows for each agent, seed: averaged (other columns: lr)"
+    assert columns in told(judge(twice))
+    lengths = lengths_table().drop(columns="episode")
+    assert "up to 120 rows for each agent, seed: averaged (other columns: steps)" in told(
+        judge(lengths)
+    )
     rows = [
         (a, "X", s, n, s) for a, most in (("a", 20), ("b", 30)) for s in (0, 1) for n in (10, most)
     ]
     made = pd.DataFrame(rows, columns=["agent", "env", "seed", "step", "return"])
-    assert "X: agents trained for 20 to 30 steps" in told(judge(made))
+    assert "X: the shortest run ends at 20 (a), the longest at 30 (b)" in told(judge(made))
 
 
 def test_files_that_are_no_logs_are_counted(tmp_path):
@@ -273,6 +312,23 @@ def test_rows_that_are_no_episodes_are_named(tmp_path):
     (log,), (note,) = find_logs([tmp_path], {})
     assert note.endswith("skipped 3 of 123 rows, no episodes: lines 12, 124, 125")
     assert log.figures == {"training": 3.0}
+
+
+def test_runs_without_the_figure_of_most_runs_are_counted(tmp_path):
+    """Of six runs one has no evaluations, another only NaN; a third has no episode at all."""
+    for seed in range(1, 7):
+        folder = tmp_path / "ppo" / str(seed)
+        folder.mkdir(parents=True)
+        old_monitor(folder, 3.0)
+        results = np.full((2, 5), np.nan if seed == 2 else float(seed))
+        if seed > 1:
+            np.savez(folder / "evaluations.npz", timesteps=[50, 100], results=results)
+    (tmp_path / "ppo" / "7").mkdir()
+    (tmp_path / "ppo" / "7" / "monitor.csv").write_text('#{"t_start": 1, "env_id": "None"}\n')
+    found = judge(tmp_path)
+    assert found.runs["final"].tolist() == [3.0, 4.0, 5.0, 6.0]
+    assert set(found.runs["environment"]) == {"environment"}
+    assert "mean return in the last evaluation left out: 3 runs without" in told(found)
 
 
 def test_labels_belong_to_one_run(tmp_path):
