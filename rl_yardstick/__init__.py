@@ -4,10 +4,8 @@ from importlib import import_module
 from typing import Any
 
 _OF_API = ("Run", "Study", "audit", "compare", "explain", "judge", "optimum", "train", "tune")
-_HOMES = dict.fromkeys(_OF_API, "api") | {
-    "rate": "rating.ratings",
-    "UserError": "pipeline.errors",
-}
+_ELSEWHERE = {"rate": "rating.ratings", "UserError": "pipeline.errors"}
+_HOMES = dict.fromkeys(_OF_API, "api") | _ELSEWHERE
 __all__ = list(_HOMES)
 
 
