@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
-from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.errors import UserError, unknown
 
 if TYPE_CHECKING:
     from rl_yardstick.rating.ratings import Rating
 
 # Suffixes of the files below a folder that are rated.
-SUFFIXES = (".npy", ".npz", ".pkl", ".pickle", ".json", ".csv", ".pt", ".pth", ".zip")
+SUFFIXES = (".npy", ".npz", ".pkl", ".pickle", ".json", ".csv", ".txt", ".pt", ".pth", ".zip")
 COLUMNS = ("file", "return", "optimum", "score", "success", "environment", "note")
 
 EPILOG = """\
@@ -129,8 +129,10 @@ def _rated_script(typed: str, env_id: str | None, **kwargs: Any) -> Rating:
 
     module, name = split_class(typed)
     import_modules([module])
-    found = getattr(sys.modules[module_name(module)], name, None)
-    rated = rate(found() if isinstance(found, type) else found, env_id, **kwargs)
+    inside = vars(sys.modules[module_name(module)])
+    if name not in inside:
+        raise unknown(f"{module} has no", name, inside)
+    rated = rate(inside[name], env_id, **kwargs)
     return replace(rated, name=typed, notes=(*rated.notes, "its own code ran"))
 
 
