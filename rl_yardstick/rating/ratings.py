@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
@@ -42,10 +41,9 @@ class Rating:
     environment: str
     evaluation: Evaluation  #: exact where the model is known; else of sampled episodes
     notes: tuple[str, ...] = ()  #: what to know about it, the most important first
-    #: of a table of values, where the model is known: the states, among those that can be reached,
-    #: in which several actions have the top value (``ties``, and ``ties_met`` on its way), the
-    #: range of the returns of all ways to break them (``ties_least``, ``ties_most``), and states
-    #: with equal values on its way and elsewhere (``equal_met``, ``equal_elsewhere``)
+    #: of a table, where the model is known: reachable states with several best actions (``ties``,
+    #: ``ties_met`` on its way), the range of returns of all ways to break ties (``ties_least``,
+    #: ``ties_most``), and states with equal values (``equal_met`` on its way, ``equal_elsewhere``)
     facts: Mapping[str, Any] = field(default_factory=dict)
     explanation: Explanation | None = None  #: where it loses
     map: str = ""  #: a grid world with the actions that it takes
@@ -71,9 +69,6 @@ class Rating:
         known = [(name, self.figures[name]) for name in list(self.figures)[:5]]
         told = ", ".join(f"{name} {number:.4g}" for name, number in known if number is not None)
         return "\n".join([f"{self.name} on {self.environment}: {told}", *self.notes, self.map])
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
 
 
 # --- tables ---------------------------------------------------------------------------------------
@@ -186,8 +181,7 @@ def rated_function(
             if found.size == n and (found >= 0).all() and abs(found.sum() - 1) <= 1e-5:
                 return found / found.sum()
         needed = f"it must return an action or {n} probabilities"
-        place = shown(np.asarray(observation).tolist())
-        raise UserError(f"{name} returns {shown(answer)} at {place}: {needed}")
+        raise UserError(f"{name} returns {shown(answer)} at {observation!s:.60}: {needed}")
 
     if world.exact is not None:
         observed = world.observed()
@@ -217,8 +211,7 @@ def called(what: Any, *given: Any) -> Any:
     except TypeError as error:
         if error.__traceback__ is None or error.__traceback__.tb_next is not None:
             raise  # of its own code
-        told = "an observation alone" if given else "nothing"
-        raise UserError(f"{one_line(error)}: it is called with {told}") from error
+        raise UserError(f"{one_line(error)}: a class gets none, a policy an observation") from error
 
 
 def is_model(path: Path) -> bool:
@@ -256,6 +249,8 @@ def rated_model(path: Path, wanted: Mapping[str, Any]) -> Rating:
 
 def content_of(path: Path) -> Any:
     """What a file holds, as data; UserError if it cannot be read."""
+    if path.suffix == ".py":
+        raise UserError(f"{path}: name what is to be rated, as in {path}:policy")
     try:
         return read_table_file(path)
     except (UnsafeFileError, OSError) as error:

@@ -46,7 +46,7 @@ def tables_in(content: Any) -> dict[str, Any]:
 
 
 def as_table(content: Any, world: World) -> Table:
-    """The table of an array, a list, or a dictionary of states.
+    """The table of an array, a list, or a dictionary of states; masked actions are illegal.
 
     Raises:
         UserError: if it is none of the environment's, with the shape that would be right.
@@ -56,18 +56,16 @@ def as_table(content: Any, world: World) -> Table:
             content = table_of_text(content.to_csv(), Budget(NO_LIMIT))
         if isinstance(content, Mapping) and content:
             return _of_mapping(content, world)
-        values = np.ma.filled(np.ma.array(content, np.float64), -np.inf)  # masked: illegal
-        return _of_array(values.squeeze(), world)
+        return _of_array(np.ma.filled(np.ma.asarray(content, np.float64), -np.inf).squeeze(), world)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
         why = "rows of different lengths" if "inhomogeneous" in str(error) else one_line(error)
         raise UserError(f"holds no table ({why}): {world.needs()}") from error
 
 
 def _of_array(array: NDArray[Any], world: World) -> Table:
-    n, n_actions = world.shape
-    if array.shape == (n + 1, n_actions) and (array[0] == range(n_actions)).all():
-        array = array[1:]  # below the numbers of the actions
-    shape = array.shape
+    shape, (n, n_actions) = array.shape, world.shape
+    if shape == (n + 1, n_actions) and (array[0] == range(n_actions)).all():
+        return _of_array(array[1:], world)  # below the numbers of the actions
     if shape in ((n,), world.sizes):
         return _of_actions(array.ravel(), np.arange(n), world)
     if shape in ((n, n_actions), (*world.sizes, n_actions)):
@@ -113,8 +111,8 @@ def _of_mapping(content: Mapping[Any, Any], world: World) -> Table:
     if wrong:
         told = f"{shown(wrong[0])}, which is no state of {world.name}, nor one with an action"
         raise UserError(f"has the key {told} from 0 to {n_actions - 1}")
-    values = np.ma.filled(np.ma.array([*content.values()], np.float64), -np.inf)
-    parts = np.array([*keys.values()])
+    legal = [np.ma.filled(np.asanyarray(row), -np.inf) for row in content.values()]
+    parts, values = np.array([*keys.values()]), np.array(legal, np.float64)
     if values.ndim == 1 and width - 1 in (1, len(world.sizes)):
         rows, actions = world.rows(parts[:, :-1]), parts[:, -1]
         if beyond := [action for action in actions.tolist() if not 0 <= action < n_actions]:

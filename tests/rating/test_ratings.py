@@ -47,8 +47,8 @@ def test_the_optimum_zeros_and_policies_by_hand():
     assert (found.mean_return, found.optimum, found.score, found.mean_length) == (1, 1, 1, 6)
     assert found.map.splitlines() == ["v???", "vX?X", ">>vX", "X>>G"]
     assert (found.equal_met, found.equal_elsewhere) == (0, 4)
+    assert repr(found).startswith("ndarray on FrozenLake-v1 (is_slippery False): ")
     assert "score 1" in repr(found)
-    assert found._repr_html_().startswith("<pre>ndarray on FrozenLake-v1 (is_slippery False): ")
     chances = np.where(table.any(axis=1, keepdims=True), table, 0.25)
     chances[4] = 0, 0.6, 0.4, 0  # to the right is a hole
     for policy in (chances, lambda state: chances[state]):
@@ -164,7 +164,7 @@ REFUSED = {
     "named actions": ({s: {"left": 0.0, "up": 0.0} for s in range(16)}, "the key (0, 'left'), "),
     "a state twice": (pd.DataFrame(np.eye(16, 4), index=[0] * 16), "several rows of one state"),
     "a class to be given something": (type("A", (), {"__init__": lambda self, env: 0}), "'env'"),
-    "a function of two": (lambda state, values: 0, "'values': it is called with an observation"),
+    "a function of two": (lambda state, values: 0, "'values': a class gets none, a policy"),
     "keys of two kinds": ({0: [0] * 4, (1, 2): [0] * 4}, "no state of FrozenLake-v1"),
     "hands": (hands(), "[4, 1, 0] is not in Discrete(16)"),
     "ragged": ([[1, 2], [3]], "holds no table"),
