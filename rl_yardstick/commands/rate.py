@@ -16,7 +16,6 @@ from rl_yardstick.pipeline.errors import UserError, unknown
 if TYPE_CHECKING:
     from rl_yardstick.rating.ratings import Rating
 
-# Suffixes of the files below a folder that are rated.
 SUFFIXES = (".npy", ".npz", ".pkl", ".pickle", ".json", ".csv", ".txt", ".pt", ".pth", ".zip")
 COLUMNS = ("file", "return", "optimum", "score", "success", "environment", "note")
 
@@ -64,7 +63,8 @@ def main() -> int:
         _print_table(console, rows)
     elif not isinstance(one := next(iter(rated.values())), str):
         where = [] if one.explanation is None else why_lines(one.explanation)
-        lines = [*result_lines(one.evaluation), *one.notes, *filter(None, [one.map]), *where]
+        more = [] if one.exact else [f"standard error {one.std_return / one.n_episodes**0.5:.2g}"]
+        lines = [*result_lines(one.evaluation, *more), *one.notes, *filter(None, [one.map]), *where]
         say(console, "\n".join([f"{one.name} on {one.environment}", *lines]))
     if args.table is not None:
         import pandas as pd
@@ -115,7 +115,7 @@ def _ratings(args: Any) -> dict[str, Rating | str]:
 
 
 def _below(path: Path) -> Iterator[Path]:
-    """A path, or the files and run folders below a folder that is no run."""
+    """A path, or the files with `SUFFIXES` and run folders below a folder that is no run."""
     from rl_yardstick.rating.ratings import is_model
 
     if not path.is_dir() or is_model(path):

@@ -137,8 +137,8 @@ def _on_values(facts: Mapping[str, Any]) -> Iterator[str]:
         met = f"{facts['ties']} states, {facts['ties_met']} on its way"
         yield f"ties in {met}: takes the first{told}"
     if facts["equal_met"] + facts["equal_elsewhere"]:
-        told = f"{facts['equal_met']} states on its way, {facts['equal_elsewhere']} elsewhere"
-        yield f"never updated (all values equal): {told}"
+        told = f"{facts['equal_met']} on its way, {facts['equal_elsewhere']} elsewhere"
+        yield f"states never updated (all values equal): {told}"
 
 
 def _better_order(world: World, exact: ExactEvaluator, policy: Ints) -> Iterator[str]:

@@ -36,7 +36,7 @@ def tables_in(content: Any) -> dict[str, Any]:
         content = content.item() if content.ndim == 0 else content.tolist()
     found = {"": content}
     if isinstance(content, Mapping) and any(isinstance(k, str) and not key_of(k) for k in content):
-        found = {str(key): value for key, value in content.items()}
+        found = {str(key): value for key, value in content.items() if not isinstance(value, str)}
     elif isinstance(content, list | tuple):
         tables = [one for one in content if isinstance(one, Mapping) or getattr(one, "ndim", 0) > 1]
         found = {str(place): one for place, one in enumerate(tables)} or found
@@ -59,7 +59,7 @@ def as_table(content: Any, world: World) -> Table:
         return _of_array(np.ma.filled(np.ma.asarray(content, np.float64), -np.inf).squeeze(), world)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
         why = "rows of different lengths" if "inhomogeneous" in str(error) else one_line(error)
-        raise UserError(f"holds no table ({why}): {world.needs()}") from error
+        raise UserError(f"holds no table ({why:.200}): {world.needs()}") from error
 
 
 def _of_array(array: NDArray[Any], world: World) -> Table:

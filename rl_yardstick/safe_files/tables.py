@@ -137,7 +137,7 @@ def table_of_text(text: str, budget: Budget) -> Any:
         with suppress(ValueError):
             return np.array(rows, dtype=np.float64)
     at = int(len(heading) > 1 and heading[1] in _STATES)  # behind the numbers of rows
-    end = at + 1 + (heading[at + 1 : -1] in (["a"], ["action"]))
+    end = at + 1 + (heading[at + 1 : -1] == ["action"])
     found = {", ".join(row[at:end]): np.array(row[end:], np.float64).squeeze() for row in rows}
     if len(found) < len(rows):
         raise UnsafeFileError("has several rows of one state, not named state, action, value")

@@ -19,7 +19,7 @@ from rl_yardstick.envs import known_models
 from rl_yardstick.pipeline.errors import UserError
 from tests.pipeline.short_runs import trained
 
-LAKE, DRY = "FrozenLake-v1", {"is_slippery": False}
+LAKE, DRY, POLE = "FrozenLake-v1", {"is_slippery": False}, "CartPole-v1"
 
 
 def planned(env_id, discount=0.99, **kwargs):
@@ -232,10 +232,11 @@ def test_tables_need_no_pytorch_and_files_run_nothing(tmp_path, typed, monkeypat
     assert json.loads((tmp_path / "marks.json").read_text())["class/hf.pkl"]["score"] > 0.9
     assert not (tmp_path / "mark").exists()
     assert max(map(len, out.splitlines())) <= 80
-    (tmp_path / "own.py").write_text("policy = lambda state: 2\n")
+    (tmp_path / "own.py").write_text("policy = lambda state: 2\nright = lambda obs: 1\n")
     code, out, _ = typed("yardstick", "rate", "own.py:policy", "--env", LAKE)
-    assert (code, "score 0 " in out) == (0, True)
+    assert (code, "score 0 " in out, "standard error" in out) == (0, True, False)
     assert "its own code ran" in out
+    assert "standard error 0.0" in typed("yardstick", "rate", "own.py:right", "--env", POLE)[1]
     _, _, err = typed("yardstick", "rate", "own.py:value", "--env", LAKE)
     assert "own.py has no 'value'" in err
     sys.modules.pop("own", None)
