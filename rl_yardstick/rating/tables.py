@@ -53,10 +53,11 @@ def as_table(content: Any, world: World) -> Table:
     """
     try:
         if hasattr(content, "to_csv"):  # of pandas
-            content = table_of_text(content.to_csv(), Budget(NO_LIMIT))
+            content = table_of_text(content.to_csv(na_rep="nan"), Budget(NO_LIMIT))
         if isinstance(content, Mapping) and content:
             return _of_mapping(content, world)
-        return _of_array(np.ma.filled(np.ma.asarray(content, np.float64), -np.inf).squeeze(), world)
+        legal: Any = np.ma.asarray(content, np.float64).filled(-np.inf)
+        return _of_array(np.asarray(legal).squeeze(), world)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
         why = "rows of different lengths" if "inhomogeneous" in str(error) else one_line(error)
         raise UserError(f"holds no table ({why:.200}): {world.needs()}") from error
@@ -102,8 +103,7 @@ def _of_mapping(content: Mapping[Any, Any], world: World) -> Table:
     missing, n_actions = 0.0, world.shape[1]
     if all(isinstance(row, Mapping) for row in content.values()):
         missing = -np.inf  # an action that is left out cannot be chosen
-        states = content.items()
-        content = {(state, action): row[action] for state, row in states for action in row}
+        content = {(state, one): row[one] for state, row in content.items() for one in row}
     keys = {key: key_of(key) for key in content}
     width = len(next(iter(keys.values())))
     last = {parts: key for key, parts in keys.items()}
@@ -111,8 +111,8 @@ def _of_mapping(content: Mapping[Any, Any], world: World) -> Table:
     if wrong:
         told = f"{shown(wrong[0])}, which is no state of {world.name}, nor one with an action"
         raise UserError(f"has the key {told} from 0 to {n_actions - 1}")
-    legal = [np.ma.filled(np.asanyarray(row), -np.inf) for row in content.values()]
-    parts, values = np.array([*keys.values()]), np.array(legal, np.float64)
+    legal = [np.ma.filled(np.asanyarray(row, np.float64), -np.inf) for row in content.values()]
+    parts, values = np.array([*keys.values()]), np.array(legal)
     if values.ndim == 1 and width - 1 in (1, len(world.sizes)):
         rows, actions = world.rows(parts[:, :-1]), parts[:, -1]
         if beyond := [action for action in actions.tolist() if not 0 <= action < n_actions]:

@@ -162,6 +162,7 @@ REFUSED = {
     "a state too many": ({s: [0, 0, 0, 1] for s in range(64)}, "([16] is not in Discrete(16)): Fr"),
     "an action too many": ({(0, 9): 1.0, (1, 0): 2.0}, "has an action 9: "),
     "named actions": ({s: {"left": 0.0, "up": 0.0} for s in range(16)}, "the key (0, 'left'), "),
+    "nan in pandas": (pd.DataFrame(np.eye(16, 4)).replace(1, np.nan), "nan in states [0, 1, 2, 3]"),
     "a state twice": (pd.DataFrame(np.eye(16, 4), index=[0] * 16), "several rows of one state"),
     "a class to be given something": (type("A", (), {"__init__": lambda self, env: 0}), "'env'"),
     "a function of two": (lambda state, values: 0, "'values': a class gets none, a policy"),
