@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
-from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.errors import UserError, unknown
 
 if TYPE_CHECKING:
     from rl_yardstick.rating.ratings import Rating
 
-# Suffixes of the files below a folder that are rated.
-SUFFIXES = (".npy", ".npz", ".pkl", ".pickle", ".json", ".csv", ".pt", ".pth", ".zip")
+SUFFIXES = (".npy", ".npz", ".pkl", ".pickle", ".json", ".csv", ".txt", ".pt", ".pth", ".zip")
 COLUMNS = ("file", "return", "optimum", "score", "success", "environment", "note")
 
 EPILOG = """\
@@ -64,7 +63,8 @@ def main() -> int:
         _print_table(console, rows)
     elif not isinstance(one := next(iter(rated.values())), str):
         where = [] if one.explanation is None else why_lines(one.explanation)
-        lines = [*result_lines(one.evaluation), *one.notes, *filter(None, [one.map]), *where]
+        more = [] if one.exact else [f"standard error {one.std_return / one.n_episodes**0.5:.2g}"]
+        lines = [*result_lines(one.evaluation, *more), *one.notes, *filter(None, [one.map]), *where]
         say(console, "\n".join([f"{one.name} on {one.environment}", *lines]))
     if args.table is not None:
         import pandas as pd
@@ -79,9 +79,9 @@ def main() -> int:
 
 def _ratings(args: Any) -> dict[str, Rating | str]:
     """The ratings by name, or why something could not be rated."""
-    from rl_yardstick.pipeline.components import split_class
+    from rl_yardstick.pipeline.components import import_modules, module_name, split_class
     from rl_yardstick.pipeline.settings import parse_assignments
-    from rl_yardstick.rating.ratings import content_of, is_model, rated_model, rated_tables
+    from rl_yardstick.rating.ratings import content_of, is_model, rate, rated_model, rated_tables
     from rl_yardstick.rating.worlds import world_of
 
     kwargs = parse_assignments(args.env_kwargs, "--env-kwargs")
@@ -94,23 +94,28 @@ def _ratings(args: Any) -> dict[str, Rating | str]:
     if not paths:
         raise UserError(f"{args.files[0]} holds no file that ends in {', '.join(SUFFIXES)}")
     for path in paths:
+        module, name = split_class(typed := str(path))
         try:
-            if split_class(str(path))[1] and not path.exists():
-                found[str(path)] = _rated_script(str(path), args.env, bins=bins, **kwargs)
+            if name and not path.exists():
+                import_modules([module])
+                if name not in (inside := vars(sys.modules[module_name(module)])):
+                    raise unknown(f"{module} has no", name, inside)
+                one = rate(inside[name], args.env, bins=bins, **kwargs)
+                found[typed] = replace(one, name=typed, notes=(*one.notes, "its own code ran"))
             elif is_model(path):
                 wanted = {"env_id": args.env, "env_kwargs": kwargs, "algo": args.algo}
-                found[str(path)] = rated_model(path, {**wanted, "typed": args.gym_packages})
+                found[typed] = rated_model(path, {**wanted, "typed": args.gym_packages})
             else:
-                found |= rated_tables(content_of(path), world, str(path))
+                found |= rated_tables(content_of(path), world, typed)
         except UserError as error:
             if len(paths) == 1:
                 raise
-            found[str(path)] = str(error).removeprefix(str(path)).lstrip(": ")
+            found[typed] = str(error).removeprefix(typed).lstrip(": ")
     return found
 
 
 def _below(path: Path) -> Iterator[Path]:
-    """A path, or the files and run folders below a folder that is no run."""
+    """A path, or the files with `SUFFIXES` and run folders below a folder that is no run."""
     from rl_yardstick.rating.ratings import is_model
 
     if not path.is_dir() or is_model(path):
@@ -120,18 +125,6 @@ def _below(path: Path) -> Iterator[Path]:
         is_wanted = not one.is_symlink() if one.is_dir() else one.suffix.lower() in SUFFIXES
         if is_wanted and not one.name.startswith((".", "__")):
             yield from _below(one)
-
-
-def _rated_script(typed: str, env_id: str | None, **kwargs: Any) -> Rating:
-    """The rating of something in a module of the user, which is imported."""
-    from rl_yardstick.pipeline.components import import_modules, module_name, split_class
-    from rl_yardstick.rating.ratings import rate
-
-    module, name = split_class(typed)
-    import_modules([module])
-    found = getattr(sys.modules[module_name(module)], name, None)
-    rated = rate(found() if isinstance(found, type) else found, env_id, **kwargs)
-    return replace(rated, name=typed, notes=(*rated.notes, "its own code ran"))
 
 
 def _row(name: str, rated: Rating | str) -> dict[str, Any]:

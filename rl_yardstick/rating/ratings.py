@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
@@ -19,7 +18,7 @@ from rl_yardstick import mdp
 from rl_yardstick.diagnosis.explanation import Explanation, explanation_of_policy
 from rl_yardstick.envs.layout import action_names
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.pipeline.errors import UserError, shown
+from rl_yardstick.pipeline.errors import UserError, one_line, shown
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 from rl_yardstick.pipeline.run import RECORD
@@ -42,10 +41,9 @@ class Rating:
     environment: str
     evaluation: Evaluation  #: exact where the model is known; else of sampled episodes
     notes: tuple[str, ...] = ()  #: what to know about it, the most important first
-    #: of a table of values, where the model is known: the states, among those that can be reached,
-    #: in which several actions have the top value (``ties``, and ``ties_met`` on its way), the
-    #: range of the returns of all ways to break them (``ties_least``, ``ties_most``), and states
-    #: with equal values on its way and elsewhere (``equal_met``, ``equal_elsewhere``)
+    #: of a table, where the model is known: reachable states with several best actions (``ties``,
+    #: ``ties_met`` on its way), the range of returns of all ways to break ties (``ties_least``,
+    #: ``ties_most``), and states with equal values (``equal_met`` on its way, ``equal_elsewhere``)
     facts: Mapping[str, Any] = field(default_factory=dict)
     explanation: Explanation | None = None  #: where it loses
     map: str = ""  #: a grid world with the actions that it takes
@@ -72,9 +70,6 @@ class Rating:
         told = ", ".join(f"{name} {number:.4g}" for name, number in known if number is not None)
         return "\n".join([f"{self.name} on {self.environment}: {told}", *self.notes, self.map])
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
-
 
 # --- tables ---------------------------------------------------------------------------------------
 
@@ -85,17 +80,22 @@ def rated_table(table: Table, world: World, name: str) -> Rating:
     is_blank = not table.is_policy and bool((table.values == first).all())
     if is_blank:
         notes.insert(0, f"never trained: every value is {first:g}")
-    if exact is None or table.is_policy:
+    if exact is None:
         best = table.values.argmax(axis=1)
         chances = table.values if table.is_policy else np.eye(world.shape[1])[best]
         return rated_function(lambda obs: chances[world.row_of(obs)], world, name, notes)
     seen, model = world.observed(), exact.model
-    values = np.zeros((model.n_states, model.n_actions))
+    values = np.full((model.n_states, model.n_actions), np.nan)
     values[[*seen]] = table.values[[world.row_of(obs) for obs in seen.values()]]
-    policy = values.argmax(axis=1)
+    unknown = np.isnan(values[:, 0])
+    values[unknown] = 1 / model.n_actions
+    policy = values if table.is_policy else values.argmax(axis=1)
     met = mdp.state_visitation(model, policy, exact.horizon) > 0
-    lowest = np.where(np.isfinite(values), values, np.inf).min(axis=1)
-    equal = (lowest >= values.max(axis=1)) & model.reachable
+    if table.is_policy:
+        if n := int((unknown & met).sum()):
+            notes.insert(0, f"{n} of {met.sum()} states on its way have no action: taken as random")
+        return _exact(world, policy, name, notes, unknown)
+    equal = (values.min(axis=1) >= values.max(axis=1)) & model.reachable
     facts = _ties(values, met, exact)
     facts |= {"equal_met": int((equal & met).sum()), "equal_elsewhere": int((equal & ~met).sum())}
     if not is_blank:
@@ -103,16 +103,14 @@ def rated_table(table: Table, world: World, name: str) -> Rating:
     return replace(_exact(world, policy, name, notes, equal), facts=facts)
 
 
-def _exact(
-    world: World, policy: Any, name: str, notes: Sequence[str] = (), equal: Bools | None = None
-) -> Rating:
+def _exact(world: World, policy: Any, name: str, notes: Sequence[str], equal: Bools) -> Rating:
     """The rating of a policy; on the map, states with equal values have a question mark."""
     assert world.exact is not None
     explained, actions = None, policy if policy.ndim == 1 else policy.argmax(axis=1)
     with suppress(UserError):  # horizon times states are too many
         explained = explanation_of_policy(world.env, world.exact, policy)
-    drawn = world.map_of(actions, np.zeros(len(policy), np.bool_) if equal is None else equal)
-    return Rating(name, world.name, world.exact.worth(policy), (*notes,), {}, explained, drawn)
+    found, drawn = world.exact.worth(policy), world.map_of(actions, equal)
+    return Rating(name, world.name, found, (*notes,), {}, explained, drawn)
 
 
 def _ties(values: Floats, met: Bools, exact: ExactEvaluator) -> dict[str, Any]:
@@ -139,8 +137,8 @@ def _on_values(facts: Mapping[str, Any]) -> Iterator[str]:
         met = f"{facts['ties']} states, {facts['ties_met']} on its way"
         yield f"ties in {met}: takes the first{told}"
     if facts["equal_met"] + facts["equal_elsewhere"]:
-        told = f"{facts['equal_met']} states on its way, {facts['equal_elsewhere']} elsewhere"
-        yield f"never updated (all values equal): {told}"
+        told = f"{facts['equal_met']} on its way, {facts['equal_elsewhere']} elsewhere"
+        yield f"states never updated (all values equal): {told}"
 
 
 def _better_order(world: World, exact: ExactEvaluator, policy: Ints) -> Iterator[str]:
@@ -174,7 +172,7 @@ def rated_function(
     start, n = int(actions.start), int(actions.n)
 
     def chances(observation: Any) -> Any:
-        answer = act(observation)
+        answer = called(act, observation)
         with suppress(ValueError, TypeError):  # no numbers
             told = answer[0] if isinstance(answer, tuple) else answer
             found: Any = np.asarray(told, np.float64).ravel()
@@ -183,7 +181,7 @@ def rated_function(
             if found.size == n and (found >= 0).all() and abs(found.sum() - 1) <= 1e-5:
                 return found / found.sum()
         needed = f"it must return an action or {n} probabilities"
-        raise UserError(f"{name} returns {shown(answer)} at {shown(observation)}: {needed}")
+        raise UserError(f"{name} returns {shown(answer)} at {observation!s:.60}: {needed}")
 
     if world.exact is not None:
         observed = world.observed()
@@ -191,7 +189,7 @@ def rated_function(
         if np.array_equal(first, second):
             policy = np.full((world.exact.model.n_states, n), 1 / n)
             policy[[*observed]] = first
-            return _exact(world, policy, name, notes)
+            return _exact(world, policy, name, notes, np.zeros(len(policy), np.bool_))
         notes = [*notes, "it draws its actions, or remembers"]
     rng = np.random.default_rng(SEED)
     found = world.played(lambda obs: start + int(rng.choice(n, p=chances(obs))))
@@ -202,8 +200,18 @@ def acting(what: Any) -> Callable[[Any], Any] | None:
     """The function of anything that acts: an object with a method for it, or a function."""
     if hasattr(what, "predict") and hasattr(what, "observation_space"):  # of the library
         return partial(what.predict, deterministic=True)
-    methods = (getattr(what, name, None) for name in ("predict", "act", "get_action"))
-    return next(filter(callable, (*methods, what)), None)
+    names = "predict", "act", "get_action", "choose_action"
+    return next(filter(callable, (*(getattr(what, name, None) for name in names), what)), None)
+
+
+def called(what: Any, *given: Any) -> Any:
+    """What a function or class makes of its arguments; UserError if it needs others."""
+    try:
+        return what(*given)
+    except TypeError as error:
+        if error.__traceback__ is None or error.__traceback__.tb_next is not None:
+            raise  # of its own code
+        raise UserError(f"{one_line(error)}: a class gets none, a policy an observation") from error
 
 
 def is_model(path: Path) -> bool:
@@ -241,6 +249,8 @@ def rated_model(path: Path, wanted: Mapping[str, Any]) -> Rating:
 
 def content_of(path: Path) -> Any:
     """What a file holds, as data; UserError if it cannot be read."""
+    if path.suffix == ".py":
+        raise UserError(f"{path}: name what is to be rated, as in {path}:policy")
     try:
         return read_table_file(path)
     except (UnsafeFileError, OSError) as error:
@@ -283,8 +293,8 @@ def rate(
     Args:
         what: an array of states x actions; a dictionary by state, or by state and action; a
             function from an observation to an action or to probabilities of actions; an object
-            with `predict`, `act` or `get_action`; or the path of a file with a table, of a model
-            zip or of a run folder. Files are read as data.
+            or class with `predict`, `act`, `get_action` or `choose_action`; a `Run`; or the path
+            of a file with a table, of a model zip or of a run folder. Files are read as data.
         env: an environment's id, or an environment. It may be left out for a run folder, and for
             a file that names its environment.
         bins: arguments of `envs.wrappers.DiscretizeObservation`, for tables of bins.
@@ -293,8 +303,12 @@ def rate(
     Raises:
         UserError: if it cannot be rated on that environment, in one line that says why.
     """
+    wanted = {"env_id": env, "env_kwargs": kwargs}
+    if hasattr(what, "folder") and hasattr(what, "spec"):  # a run
+        what, wanted["typed"] = what.folder, what.spec.gym_packages
     if isinstance(what, str | Path) and is_model(Path(what)) and not isinstance(env, gym.Env):
-        return rated_model(Path(what), {"env_id": env, "env_kwargs": kwargs})
+        return rated_model(Path(what), wanted)
+    what = called(what) if isinstance(what, type) else what
     name = str(what) if isinstance(what, str | Path) else type(what).__name__
     what = content_of(Path(what)) if isinstance(what, str | Path) else what
     if (act := acting(what)) is not None:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.errors import UserError, one_line, shown
 from rl_yardstick.rating.worlds import World, by, key_of
+from rl_yardstick.safe_files.files import NO_LIMIT, Budget
+from rl_yardstick.safe_files.tables import table_of_text
 
 SUMS_TO_ONE = 1e-6
 # Names of the table among the contents of a file, the likeliest first.
@@ -20,7 +22,7 @@ USUAL_NAMES = ("qtable", "q_table", "q", "q_values", "qvalues", "table", "policy
 class Table(NamedTuple):
     """The values of actions, or their probabilities, in each state that can be observed."""
 
-    values: Floats  #: shape (rows, actions), as numbered by `World.rows`
+    values: Floats  #: shape (rows, actions), of `World.rows`; nan in states that a policy lacks
     is_policy: bool  #: whether they are probabilities
     note: str = ""  #: how the source was read, where that is not obvious
 
@@ -34,36 +36,39 @@ def tables_in(content: Any) -> dict[str, Any]:
         content = content.item() if content.ndim == 0 else content.tolist()
     found = {"": content}
     if isinstance(content, Mapping) and any(isinstance(k, str) and not key_of(k) for k in content):
-        found = {str(key).lower(): value for key, value in content.items()}
+        found = {str(key): value for key, value in content.items() if not isinstance(value, str)}
     elif isinstance(content, list | tuple):
         tables = [one for one in content if isinstance(one, Mapping) or getattr(one, "ndim", 0) > 1]
         found = {str(place): one for place, one in enumerate(tables)} or found
-    usual = [name for name in USUAL_NAMES if name in found][:1]
-    kinds: Any = np.ndarray | list | tuple | Mapping
-    found = {name: found[name] for name in usual or found if isinstance(found[name], kinds)}
+    usual = [one for name in USUAL_NAMES for one in found if one.lower() == name][:1]
+    found = {name: found[name] for name in usual or found if hasattr(found[name], "__len__")}
     return {"": next(iter(found.values()))} if len(found) == 1 else found
 
 
 def as_table(content: Any, world: World) -> Table:
-    """The table of an array, a list, or a dictionary of states.
+    """The table of an array, a list, or a dictionary of states; masked actions are illegal.
 
     Raises:
         UserError: if it is none of the environment's, with the shape that would be right.
     """
     try:
+        if hasattr(content, "to_csv"):  # of pandas
+            content = table_of_text(content.to_csv(na_rep="nan"), Budget(NO_LIMIT))
         if isinstance(content, Mapping) and content:
             return _of_mapping(content, world)
-        return _of_array(np.asarray(content, np.float64).squeeze(), world)
-    except (ValueError, TypeError, OverflowError) as error:
-        is_ragged = "inhomogeneous" in str(error)
-        why = "rows of different lengths" if is_ragged else one_line(error)
-        raise UserError(f"holds no table ({why}): {world.needs()}") from error
+        legal: Any = np.ma.asarray(content, np.float64).filled(-np.inf)
+        return _of_array(np.asarray(legal).squeeze(), world)
+    except (ValueError, TypeError, OverflowError, RuntimeError) as error:
+        why = "rows of different lengths" if "inhomogeneous" in str(error) else one_line(error)
+        raise UserError(f"holds no table ({why:.200}): {world.needs()}") from error
 
 
 def _of_array(array: NDArray[Any], world: World) -> Table:
     shape, (n, n_actions) = array.shape, world.shape
-    if shape == (n,):
-        return _of_actions(array, np.arange(n), world)
+    if shape == (n + 1, n_actions) and (array[0] == range(n_actions)).all():
+        return _of_array(array[1:], world)  # below the numbers of the actions
+    if shape in ((n,), world.sizes):
+        return _of_actions(array.ravel(), np.arange(n), world)
     if shape in ((n, n_actions), (*world.sizes, n_actions)):
         return _of_values(array.reshape(n, n_actions), np.arange(n), world)
     if shape == (n_actions, n):
@@ -79,16 +84,16 @@ def _of_actions(actions: NDArray[Any], rows: Ints, world: World) -> Table:
     if not np.isin(actions, range(world.shape[1])).all():
         raise UserError(f"holds one value of each state: {world.needs()}")
     chances = np.eye(world.shape[1])[actions.astype(np.int64)]
-    return _of_values(chances, rows, world, "one action of each state: rated as a policy")
+    return _of_values(chances, rows, world, "it holds actions: rated as a policy")
 
 
 def _of_values(values: NDArray[Any], rows: Ints, world: World, note: str = "") -> Table:
     """The table with values of these rows; if all are probabilities, it is a policy."""
-    if n_wrong := int(np.isnan(values).any(axis=1).sum()):
-        raise UserError(f"holds nan in {n_wrong} states")
+    if len(wrong := rows[np.isnan(values).any(axis=1)]):
+        raise UserError(f"holds nan in states {shown(wrong.tolist())}: illegal actions need -inf")
     is_policy = bool((abs(values.sum(axis=1) - 1) <= SUMS_TO_ONE).all() and (values >= 0).all())
-    table = np.full(world.shape, 1 / world.shape[1] if is_policy else 0.0)
-    table[rows] = values
+    table = np.full(world.shape, np.nan if is_policy else 0.0)
+    table[rows] = values / values.sum(axis=1, keepdims=True) if is_policy else values
     told = "its rows sum to 1: rated as probabilities of actions" if is_policy else ""
     return Table(table, is_policy, note or told)
 
@@ -98,14 +103,16 @@ def _of_mapping(content: Mapping[Any, Any], world: World) -> Table:
     missing, n_actions = 0.0, world.shape[1]
     if all(isinstance(row, Mapping) for row in content.values()):
         missing = -np.inf  # an action that is left out cannot be chosen
-        states = content.items()
-        content = {(state, action): row[action] for state, row in states for action in row}
+        content = {(state, one): row[one] for state, row in content.items() for one in row}
     keys = {key: key_of(key) for key in content}
     width = len(next(iter(keys.values())))
-    wrong = [key for key, parts in keys.items() if len(parts) != width or not parts]
+    last = {parts: key for key, parts in keys.items()}
+    wrong = [k for k, parts in keys.items() if not parts or len(parts) != width or last[parts] != k]
     if wrong:
-        raise UserError(f"has the key {shown(wrong[0])}, which is no state of {world.name}")
-    parts, values = np.array([*keys.values()]), np.array([*content.values()], np.float64)
+        told = f"{shown(wrong[0])}, which is no state of {world.name}, nor one with an action"
+        raise UserError(f"has the key {told} from 0 to {n_actions - 1}")
+    legal = [np.ma.filled(np.asanyarray(row, np.float64), -np.inf) for row in content.values()]
+    parts, values = np.array([*keys.values()]), np.array(legal)
     if values.ndim == 1 and width - 1 in (1, len(world.sizes)):
         rows, actions = world.rows(parts[:, :-1]), parts[:, -1]
         if beyond := [action for action in actions.tolist() if not 0 <= action < n_actions]:

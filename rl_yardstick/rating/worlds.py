@@ -134,8 +134,7 @@ class World:
             if letter in (FREE, START) and self.exact.model.reachable[cell]:
                 sign = _ARROWS.get(layout.moves[actions[cell]], "*")
                 cells[cell] = "?" if is_blank[cell] else sign
-        width = layout.n_columns
-        return "\n".join("".join(cells[at : at + width]) for at in range(0, len(cells), width))
+        return "\n".join(map("".join, np.reshape(cells, (-1, layout.n_columns))))
 
 
 def world_of(

@@ -526,7 +526,7 @@ def why_lines(explained: Explanation) -> list[str]:
         for place, reached in explained.repairs
     ]
     if regained:
-        told.append(f"with the best action in {'; and in '.join(regained)}")
+        told.append(f"with the best action at each step in {'; and in '.join(regained)}")
     return told
 
 

@@ -56,7 +56,9 @@ def read_table_file(source: Source) -> Any:
             budget.charge_json(content)
             return json.loads(content.decode("utf-8-sig"))
         if suffix in (".csv", ".tsv", ".txt"):
-            return _rows(content.decode("utf-8-sig"), budget)
+            return table_of_text(content.decode("utf-8-sig"), budget)
+        if not content.rstrip().endswith(b"."):
+            raise UnsafeFileError("is cut off, or no .npy, .npz, .json, .csv, pickle or newer .pt")
         return read_pickled_table(content, budget)
     except UnsafeFileError:
         raise
@@ -124,14 +126,19 @@ def _archive(content: bytes, budget: Budget) -> Any:
     return {name.removesuffix(".npy"): _array_file(members[name], budget) for name in members}
 
 
-def _rows(text: str, budget: Budget) -> Any:
-    """The rows of a text with separators: an array, or a dictionary if they begin with a state."""
+def table_of_text(text: str, budget: Budget) -> Any:
+    """A text with separators: an array, or a dictionary if rows begin with a state (and action)."""
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     separator = next((sign for sign in "\t;," if sign in lines[0]), " ")
     budget.charge(_BYTES_PER_CELL * (text.count(separator) + len(lines)))
     rows = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
-    heading = [] if all(map(_NUMBER.search, rows[0])) else rows.pop(0)
-    if not heading or heading[0].lower() not in _STATES:
+    heading = [] if all(map(_NUMBER.search, rows[0])) else [one.lower() for one in rows.pop(0)]
+    if not heading or heading[0] not in _STATES:
         with suppress(ValueError):
             return np.array(rows, dtype=np.float64)
-    return {row[0]: np.array(row[1:], dtype=np.float64) for row in rows}
+    at = int(len(heading) > 1 and heading[1] in _STATES)  # behind the numbers of rows
+    end = at + 1 + (heading[at + 1 : -1] == ["action"])
+    found = {", ".join(row[at:end]): np.array(row[end:], np.float64).squeeze() for row in rows}
+    if len(found) < len(rows):
+        raise UnsafeFileError("has several rows of one state, not named state, action, value")
+    return found

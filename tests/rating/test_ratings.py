@@ -9,15 +9,17 @@ from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
+import torch as th
 from stable_baselines3 import PPO
 
-from rl_yardstick import mdp, rate
+from rl_yardstick import Run, mdp, rate
 from rl_yardstick.envs import known_models
 from rl_yardstick.pipeline.errors import UserError
 from tests.pipeline.short_runs import trained
 
-LAKE, DRY = "FrozenLake-v1", {"is_slippery": False}
+LAKE, DRY, POLE = "FrozenLake-v1", {"is_slippery": False}, "CartPole-v1"
 
 
 def planned(env_id, discount=0.99, **kwargs):
@@ -45,12 +47,27 @@ def test_the_optimum_zeros_and_policies_by_hand():
     assert (found.mean_return, found.optimum, found.score, found.mean_length) == (1, 1, 1, 6)
     assert found.map.splitlines() == ["v???", "vX?X", ">>vX", "X>>G"]
     assert (found.equal_met, found.equal_elsewhere) == (0, 4)
+    assert repr(found).startswith("ndarray on FrozenLake-v1 (is_slippery False): ")
     assert "score 1" in repr(found)
-    assert found._repr_html_().startswith("<pre>ndarray on FrozenLake-v1 (is_slippery False): ")
     chances = np.where(table.any(axis=1, keepdims=True), table, 0.25)
     chances[4] = 0, 0.6, 0.4, 0  # to the right is a hole
     for policy in (chances, lambda state: chances[state]):
         assert rate(policy, LAKE, **DRY).mean_return == pytest.approx(0.6)
+
+
+def test_a_policy_is_random_in_states_that_it_lacks():
+    # In state 8, a random action leads on, into a hole, or to where it is tried again.
+    found = rate({0: 1, 4: 1, 9: 2, 10: 1, 14: 2}, LAKE, **DRY)
+    assert found.mean_return == pytest.approx(0.5)
+    assert found.notes[0] == "1 of 6 states on its way have no action: taken as random"
+    assert found.map.splitlines()[2] == "?>vX"
+
+
+def test_illegal_actions_are_no_missing_update(lake):
+    legal = lake == lake.max(axis=1, keepdims=True)
+    found = rate(np.where(legal, lake, -np.inf), LAKE)
+    assert (found.equal_met, found.equal_elsewhere) == (0, 0)
+    assert "?" not in found.map
 
 
 def test_the_range_of_ties_is_that_of_all_policies():
@@ -80,6 +97,7 @@ def test_another_order_of_actions_is_found(lake):
 def forms(values):
     """The same table in the forms in which people hold it."""
     pairs = {(s, a): values[s, a] for s, a in np.ndindex(values.shape)}
+    top = values == values.max(axis=1, keepdims=True)
     return {
         "a list": values.tolist(),
         "by state and action": {s: dict(enumerate(row)) for s, row in enumerate(values)},
@@ -95,6 +113,16 @@ def forms(values):
         "a predictor": SimpleNamespace(predict=lambda state: (values[state].argmax(), None)),
         "another agent": SimpleNamespace(get_action=lambda state: values[state].argmax()),
         "transposed": values.T,
+        "masked": np.ma.masked_array(np.where(top, values, 9), ~top),
+        "masked by state": {s: np.ma.masked_array(values[s], ~top[s]) for s in range(len(values))},
+        "below the actions": np.vstack([range(4), values]),
+        "a tensor": th.tensor(values),
+        "a frame": pd.DataFrame(values).sample(frac=1, random_state=0),
+        "a long frame": pd.DataFrame(
+            [(*pair, value) for pair, value in pairs.items()], columns=["state", "action", "q"]
+        ),
+        "a series": pd.Series(values.argmax(axis=1)),
+        "a chooser": SimpleNamespace(choose_action=lambda state: values[state].argmax()),
     }
 
 
@@ -117,7 +145,7 @@ def test_hands_of_blackjack_in_every_form():
     pairs = {(hand, action): row[action] for hand, row in table.items() for action in (0, 1)}
     policy = {hand: int(row.argmax()) for hand, row in table.items()}
     texts = {str(hand): row.tolist() for hand, row in table.items()}
-    kinds = [table, whole, whole.reshape(-1, 2), pairs, policy, texts]
+    kinds = [table, whole, whole.reshape(-1, 2), whole.argmax(axis=-1), pairs, policy, texts]
     kinds.append(lambda hand: int(hand[0] < 18))
     found = {round(rate(kind, "Blackjack-v1").mean_return, 12) for kind in kinds}
     env = gym.make("Blackjack-v1")
@@ -130,9 +158,14 @@ REFUSED = {
     "another map": (np.zeros((64, 4)), "(states x actions); it fits --env-kwargs map_name:8x8"),
     "another game": (np.zeros((500, 6)), "500 x 6: FrozenLake-v1 needs 16 x 4"),
     "values of states": (np.linspace(0, 1, 16), "one value of each state"),
-    "nan": (np.where(np.eye(16, 4) > 0, np.nan, 1.0), "nan in 4 states"),
+    "nan": (np.where(np.eye(16, 4) > 0, np.nan, 1.0), "nan in states [0, 1, 2, 3]: illegal"),
     "a state too many": ({s: [0, 0, 0, 1] for s in range(64)}, "([16] is not in Discrete(16)): Fr"),
     "an action too many": ({(0, 9): 1.0, (1, 0): 2.0}, "has an action 9: "),
+    "named actions": ({s: {"left": 0.0, "up": 0.0} for s in range(16)}, "the key (0, 'left'), "),
+    "nan in pandas": (pd.DataFrame(np.eye(16, 4)).replace(1, np.nan), "nan in states [0, 1, 2, 3]"),
+    "a state twice": (pd.DataFrame(np.eye(16, 4), index=[0] * 16), "several rows of one state"),
+    "a class to be given something": (type("A", (), {"__init__": lambda self, env: 0}), "'env'"),
+    "a function of two": (lambda state, values: 0, "'values': a class gets none, a policy"),
     "keys of two kinds": ({0: [0] * 4, (1, 2): [0] * 4}, "no state of FrozenLake-v1"),
     "hands": (hands(), "[4, 1, 0] is not in Discrete(16)"),
     "ragged": ([[1, 2], [3]], "holds no table"),
@@ -171,7 +204,7 @@ def test_without_a_model_episodes_are_sampled():
 
 def test_a_model_and_its_run_have_the_rating_of_its_training(tmp_path):
     run, outcome = trained("qlearning", LAKE, {}, folder=tmp_path, n_timesteps=3000)
-    for path in (run.path, run.path / f"{LAKE}.zip"):
+    for path in (run.path, run.path / f"{LAKE}.zip", Run(run.path)):
         assert rate(path).mean_return == outcome.final.mean_return
     agent = PPO("MlpPolicy", LAKE, n_steps=8, batch_size=8, device="cpu", seed=0)
     actions = [int(agent.predict(np.array(s), deterministic=True)[0]) for s in range(16)]
@@ -200,10 +233,13 @@ def test_tables_need_no_pytorch_and_files_run_nothing(tmp_path, typed, monkeypat
     assert json.loads((tmp_path / "marks.json").read_text())["class/hf.pkl"]["score"] > 0.9
     assert not (tmp_path / "mark").exists()
     assert max(map(len, out.splitlines())) <= 80
-    (tmp_path / "own.py").write_text("policy = lambda state: 2\n")
+    (tmp_path / "own.py").write_text("policy = lambda state: 2\nright = lambda obs: 1\n")
     code, out, _ = typed("yardstick", "rate", "own.py:policy", "--env", LAKE)
-    assert (code, "score 0 " in out) == (0, True)
+    assert (code, "score 0 " in out, "standard error" in out) == (0, True, False)
     assert "its own code ran" in out
+    assert "standard error 0.0" in typed("yardstick", "rate", "own.py:right", "--env", POLE)[1]
+    _, _, err = typed("yardstick", "rate", "own.py:value", "--env", LAKE)
+    assert "own.py has no 'value'" in err
     sys.modules.pop("own", None)
     light = f"import numpy, sys\nfrom rl_yardstick import rate\nrate(numpy.eye(16, 4), '{LAKE}')"
     code = f"{light}\nsys.exit('torch' in sys.modules)"

@@ -135,6 +135,9 @@ TEXTS = {
     "spaces.txt": ("# of savetxt\n0 1\n2 3\n", np.array([[0.0, 1], [2, 3]])),
     "pandas.csv": (",0,1\n0,5,6\n1,7,8\n", {"0": np.array([5.0, 6]), "1": np.array([7.0, 8])}),
     "named.csv": ("left,right\n1,2\n", np.array([[1.0, 2]])),
+    "pairs.csv": ("state,action,q\n0,0,5\n0,1,6\n", {"0, 0": 5.0, "0, 1": 6.0}),
+    "rows.csv": (",state,Action,q\n8,1,0,5\n9,0,1,6\n", {"1, 0": 5.0, "0, 1": 6.0}),
+    "policy.csv": ("state,action\n0,5\n1,6\n", {"0": 5.0, "1": 6.0}),
     "hands.csv": ('"(14, 10, False)",1,2\n', {"(14, 10, False)": np.array([1.0, 2])}),
 }
 
