@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
@@ -69,6 +70,9 @@ class Rating:
         known = [(name, self.figures[name]) for name in list(self.figures)[:5]]
         told = ", ".join(f"{name} {number:.4g}" for name, number in known if number is not None)
         return "\n".join([f"{self.name} on {self.environment}: {told}", *self.notes, self.map])
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
 
 
 # --- tables ---------------------------------------------------------------------------------------
