@@ -51,7 +51,8 @@ OF_EPISODES = ("episodic_return", "episode_return", "episode_reward", "episode_r
 OF_MEANS = ("ep_rew_mean", "eprewmean", "episode_reward_mean", "avg_episodic_return")
 # Other files in run folders of this project.
 _NO_LOGS = ("diagnosis.csv", "value_maps.npz", "pulls.npz", "pull_statistics.npz")
-_OF_RUN = re.compile(r"(\d+\.)?monitor\.csv|evaluations\.npz|progress\.csv|run\.json|.*tfevents.*")
+_MONITOR = r"((\d+|monitor)\.)?monitor\.csv"  # SB3 adds it to a name that is no folder's
+_OF_RUN = re.compile(rf"{_MONITOR}|evaluations\.npz|progress\.csv|run\.json|.*tfevents.*")
 
 NOTHING = Episodes(np.empty(0), np.empty(0), np.empty(0))
 

@@ -84,6 +84,12 @@ def monitors(folder, value):
     monitor(folder / "1", [value - 0.5] * 30)
 
 
+def named_monitor(folder, value):
+    """As ``Monitor(env, "folder/monitor")`` names it."""
+    monitor(folder / "monitor", episodes(value))
+    assert [path.name for path in folder.iterdir()] == ["monitor.monitor.csv"]
+
+
 def old_monitor(folder, value):
     rows = "".join(f"{r},1,{0.5 * k}\n" for k, r in enumerate(episodes(value)))
     (folder / "monitor.csv").write_text(rows)
@@ -130,7 +136,8 @@ def sampled(folder, value):
 
 
 @pytest.mark.parametrize(
-    "write", [monitors, old_monitor, damaged_monitor, evaluations, progress, events, sampled]
+    "write",
+    [monitors, named_monitor, old_monitor, damaged_monitor, evaluations, progress, events, sampled],
 )
 def test_run_folders_are_judged_as_their_numbers_are(tmp_path, write):
     for (agent, seed), value in FIGURES.items():
