@@ -158,11 +158,11 @@ def compare(envs: Any, algos: Any, seeds: int = 10, **settings: Any) -> Study:
     classes, it needs another ``name``.
     """
     args = _flags(compare_command, envs, algos, {"seeds": seeds, **settings})
-    study, text = compare_command.study_spec(args), StringIO()
+    study, text, again = compare_command.study_spec(args), StringIO(), "the same call"
     record, root = StudyRecord(study, specs_of(study)), Path(args.log_folder) / study.name
     workers = compare_command.workers_of(args, root, study.run_timeout)
     with _at_work() as work, compare_command.held(root), workers:
-        job = compare_command.Job(root, args.command, *work, workers, not args.no_report)
+        job = compare_command.Job(root, args.command, *work, workers, not args.no_report, again)
         results, _ = compare_command.finished(job, record)
         if results.summary.empty:
             raise UserError(f"no run has finished: {next(iter(results.failures.values()), '')}")
@@ -364,6 +364,8 @@ def _at_work(verbose: int = 1) -> Iterator[tuple[TextConsole, Stop]]:
         yield TextConsole(quiet=verbose < 1, **options), Stop().listen()
     except Stopped:
         raise KeyboardInterrupt("stopped at a safe moment") from None
+    except OSError as error:
+        raise UserError(f"{error.filename or 'a file'}: {error.strerror or error}") from error
     finally:
         main.update({name: value for name, value in hidden.items() if value is not None})
         for number, handler in handlers.items():

@@ -95,12 +95,14 @@ class PlainAgent(OnlineAlgorithm):
 
     def values_at(self, rows: list[Any]) -> Floats | None:
         """Its values at n observations, shape (n, A) or (n,); None without ``values``."""
-        if not hasattr(self.plain, "values"):
+        if not callable(getattr(self.plain, "values", None)):
             return None
         values = np.array([self.judged.values(row) for row in rows], dtype=np.float64)
-        n = getattr(self.action_space, "n", 0)  # of actions
-        if values.shape[1:] not in ((), (n,)) or np.isnan(values).any():
-            raise ValueError(f"{self.plain.__name__}.values(obs) is not one number, or {n} of them")
+        n, name = getattr(self.action_space, "n", 0), f"{self.plain.__name__}.values(obs)"
+        if values.shape[1:] not in ((), (n,)):
+            raise ValueError(f"{name} is not one number, or {n} of them")
+        if np.isnan(values).any():
+            raise ValueError(f"{name} is NaN for an observation")
         return values
 
     def as_array(self, action: Any) -> NDArray[Any]:
@@ -110,7 +112,8 @@ class PlainAgent(OnlineAlgorithm):
             found = np.asarray(action, dtype=space.dtype).reshape(space.shape)
             action = np.clip(found, space.low, space.high)
         if not space.contains(action):
-            raise ValueError(f"{self.plain.__name__}.act returned {action!r}, not in {space}")
+            hint = ": return int(...)" if space.shape == () and type(action) is not int else ""
+            raise ValueError(f"{self.plain.__name__}.act returned {action!r}, not in {space}{hint}")
         return np.asarray(action, dtype=space.dtype)
 
     def _choose_actions(self) -> NDArray[Any]:
@@ -148,7 +151,11 @@ class PlainAgent(OnlineAlgorithm):
         """Why its greedy actions are no function of observations; empty if they are one."""
         kept = []
         for part in (observations, observations[::-1]):  # the first may make rows of a table
-            actions, _ = self.predict(part, deterministic=True)
+            try:
+                actions, _ = self.predict(part, deterministic=True)
+            except AttributeError:  # of what `reset` sets
+                self.judged.reset()
+                actions, _ = self.predict(part, deterministic=True)
             generators = random.getstate(), np.random.get_state()  # noqa: NPY002
             kept.append((actions, cloudpickle.dumps((self.judged, generators))))
         if np.array_equal(kept[0][0], kept[1][0][::-1]) and kept[0][1] == kept[1][1]:

@@ -79,7 +79,7 @@ def obstacle(
     n_states = len(observations)
     if reason := _cannot_be_asked(agent, masks):
         return reason
-    if is_network(agent) and n_states * _n_inputs(agent) > MOST_NUMBERS:
+    if is_network(agent) and n_states * spaces.flatdim(agent.observation_space) > MOST_NUMBERS:
         return f"querying a network in {n_states:,} states takes longer than playing"
     if isinstance(agent, PlanningAgent):
         if agent.policy.is_stationary or n_states * horizon <= MOST_PLANNED:
@@ -101,7 +101,8 @@ def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
         asked = [agent.predict(observations, deterministic=True) for _ in range(2)]
         first, second = (np.asarray(actions) for actions, _ in asked)
     except Exception as error:  # noqa: BLE001  # a stranger's code can fail in any way
-        return f"predict takes no batch of observations ({type(error).__name__})"
+        fails = "act or values fails" if isinstance(agent, PlainAgent) else "predict takes no batch"
+        return f"{fails}: {type(error).__name__}: {error}"
     if first.shape != observations.shape[:1]:
         return f"predict returns actions of shape {first.shape} for {len(observations)} states"
     if any(state is not None for _, state in asked):
@@ -205,18 +206,14 @@ def _in_parts(
 ) -> NDArray[Any]:
     """Call ``asked`` on batches of observations that a network can take."""
     n_states = len(observations)
-    n_rows = max(MOST_AT_ONCE // _n_inputs(agent), 1) if is_network(agent) else n_states
+    n_inputs = max(spaces.flatdim(agent.observation_space), 1)
+    n_rows = max(MOST_AT_ONCE // n_inputs, 1) if is_network(agent) else n_states
     told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
     if n_states <= n_rows:
         return asked(observations, **told)
     parts = [slice(i, i + n_rows) for i in range(0, n_states, n_rows)]
     found = [asked(observations[p], **{name: m[p] for name, m in told.items()}) for p in parts]
     return np.concatenate(found)
-
-
-def _n_inputs(agent: BaseAlgorithm) -> int:
-    """The size of a flattened observation."""
-    return max(int(spaces.flatdim(agent.observation_space)), 1)
 
 
 def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:

@@ -29,7 +29,7 @@ import gymnasium as gym
 from pydantic import Field, TypeAdapter, ValidationError
 
 from rl_yardstick.agents.own_classes import SMALLEST
-from rl_yardstick.agents.registry import BY_VALUE, add_class
+from rl_yardstick.agents.registry import ALGORITHMS, BY_VALUE, add_class
 from rl_yardstick.pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
@@ -143,7 +143,10 @@ def digests_of(typed: Iterable[str], *names: str) -> dict[str, str]:
 
 
 def check_code(spec: TrainSpec, where: str) -> None:
-    """Raise UserError if the user's modules have changed since a training was begun."""
+    """Raise UserError if the user's classes are not there, or have changed since a training."""
+    if spec.algo not in ALGORITHMS or spec.env_id not in gym.registry:
+        fault = "was begun in Python, with classes of a script or notebook"
+        raise UserError(f"{where} {fault}: the same call of compare there goes on with a study")
     here = digests_of(spec.gym_packages)
     if changed := [name for name in here if spec.code.get(name, here[name]) != here[name]]:
         raise UserError(f"{where} was begun with other code of {', '.join(changed)}")

@@ -87,6 +87,9 @@ MISFITS = [  # agent, observations, actions, and why it does not fit
     ("dqn", spaces.Discrete(4, start=1), DISCRETE, f"{NOT_ZERO} Discrete(4, start=1)"),
     ("ppo", BOX, FROM_ONE, f"{NOT_ZERO} MultiDiscrete([2 2], start=[1 0])"),
     ("a2c", MIXED, DISCRETE, f"{NOT_ZERO} {MIXED}: shift it by Gymnasium's TransformObservation"),
+    ("ppo", BOX, spaces.Box(-1, 0, (2,), np.int64), "it acts in no Box(-1, 0, (2,), int64)"),
+    ("ppo", spaces.Box(0, 9, (), np.int32), DISCRETE, "it observes no Box(0, 9, (), int32)"),
+    ("dqn", spaces.MultiDiscrete([[2, 3]]), DISCRETE, "it observes no MultiDiscrete([[2 3]])"),
     ("angle", spaces.Box(-1, 1, (2,)), DISCRETE,
      "it needs observations of shape (4,), not (2,)"),
 ]  # fmt: skip
