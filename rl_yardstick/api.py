@@ -324,7 +324,7 @@ def _environment(given: Any, is_alone: bool = True) -> tuple[str, dict[str, Any]
         if is_alone or not own:
             return spec.id, own
     if not (is_object or callable(given)):
-        raise UserError(f"an environment is an id, an object or a class, not {shown(given)}")
+        raise UserError(f"an environment is an id, one object or a class, not {shown(given)}")
     for known in gym.registry.values():
         if given in (known.entry_point, *getattr(known.entry_point, "args", ())):
             return known.id, {}
@@ -339,8 +339,10 @@ def _environment(given: Any, is_alone: bool = True) -> tuple[str, dict[str, Any]
 
 def _agent(algo: str | type) -> str:
     """The name of an agent; a class of the user gets one."""
+    if isinstance(algo, str):
+        return algo
     if not isinstance(algo, type):
-        return str(algo)
+        raise UserError(f"an agent is a name or a class, not {shown(algo)}")
     if algo.__module__.partition(".")[0] in ("rl_yardstick", "stable_baselines3", "sb3_contrib"):
         place = f":{algo.__name__}"
         return next(k for k, one in agents.ALGORITHMS.items() if one.entry_point.endswith(place))

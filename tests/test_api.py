@@ -97,7 +97,9 @@ def test_an_explanation_is_of_a_run_a_path_or_a_model(run):
         (lambda: ys.train("FrozenLake-v1", "qlearnin"), "did you mean 'qlearning'?"),
         (lambda: ys.train("FrozenLake-v1", "qlearning", gama=1), "did you mean 'gamma'?"),
         (lambda: ys.train("FrozenLake-v1", "qlearning", seed=-3), "--seed: must be a whole number"),
-        (lambda: ys.train(3), "an environment is an id, an object or a class, not 3"),
+        (lambda: ys.train(3), "an environment is an id, one object or a class, not 3"),
+        (lambda: ys.train("CartPole-v1", Line()), "an agent is a name or a class, not <"),
+        (lambda: ys.compare("FrozenLake-v1", [Learner] * 2), "test_api.Learner twice"),
         (lambda: ys.compare("FrozenLake-v1", "ppo", 0), "--seeds: must be a whole number"),
         (lambda: ys.compare("FrozenLake-v1", "ppo", n=1, sed=1), "no hyperparameter 'sed'"),
         (lambda: ys.explain(Line()), "needs its env"),
@@ -178,7 +180,11 @@ def test_classes_of_a_script_train_in_parallel(tmp_path, typed):
     assert "\n4 Chance random None " in printed
     assert printed.endswith("<pre> True\n")
     code, _, err = typed("compare.py", "--resume", "logs/studies/Mine-v0_Chance-random")
-    assert (code, err.count("\n"), "the same call of compare there goes on" in err) == (2, 1, True)
+    assert (code, err.count("\n"), "the same call of compare there continues" in err) == (
+        2,
+        1,
+        True,
+    )
 
 
 def test_an_interrupt_ends_at_a_safe_moment_and_leaves_no_handler(monkeypatch, capsys):

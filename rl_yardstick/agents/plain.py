@@ -7,6 +7,7 @@ import hmac
 import inspect
 import pickle
 import random
+import traceback
 from copy import deepcopy
 from functools import cache, cached_property
 from typing import Any, ClassVar, Self
@@ -21,7 +22,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 from rl_yardstick.agents.common import model_files
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm, Transitions
-from rl_yardstick.agents.own_classes import hyperparameters_of, parameters_of
+from rl_yardstick.agents.own_classes import GIVEN, hyperparameters_of, parameters_of
 from rl_yardstick.mdp.transition_model import Floats
 
 
@@ -67,7 +68,13 @@ class PlainAgent(OnlineAlgorithm):
         self.policy = PlainPolicy(self.observation_space, self.action_space)
         self.policy.owner = self
         self.agent = self._made()
-        _ = self.judged, self._state()  # what fails, fails at the start
+        try:
+            model_files.encode((self.judged, self._state())[1])  # what fails, fails at the start
+        except TypeError as error:
+            seen = [frame.f_locals for frame, _ in traceback.walk_tb(error.__traceback__)]
+            keys = [str(at.get("key") or at["pair"][0]) for at in seen if {*at} & {"key", "pair"}]
+            place = ".".join([self.plain.__name__, *keys])
+            raise ValueError(f"{place}: {error}: leave it out, as by __getstate__") from error
 
     def _made(self) -> Any:
         seen, done, outside = self.observation_space, self.action_space, gym.Env[Any, Any]()
@@ -75,7 +82,11 @@ class PlainAgent(OnlineAlgorithm):
         given = {"observation_space": seen, "action_space": done, "seed": self.seed, "env": outside}
         given |= {"n_states": getattr(seen, "n", None), "n_actions": getattr(done, "n", None)}
         kept = {name: given[name] for name in given if name in parameters_of(self.plain)}
-        return self.plain(**kept, **self.hyperparams)
+        own, given = hyperparameters_of(self.plain), self.hyperparams
+        if lacks := [k for k, one in own.items() if one.default is one.empty and k not in given]:
+            ways = f"give -params {lacks[0]}:VALUE; filled in are {', '.join(GIVEN)}"
+            raise ValueError(f"{self.plain.__name__} needs {', '.join(lacks)}: {ways}")
+        return self.plain(**kept, **given)
 
     # --- acting and learning ----------------------------------------------------------------------
 

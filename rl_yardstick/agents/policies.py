@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,7 @@ from rl_yardstick.agents.bandits.tables import ValueBandit
 from rl_yardstick.agents.common.exploration import BOLTZMANN
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm, tiles_of_all, vectors_of
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
+from rl_yardstick.agents.own_classes import parameters_of
 from rl_yardstick.agents.plain import PlainAgent, rows_of
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
@@ -49,13 +48,8 @@ def has_memory(agent: BaseAlgorithm) -> bool:
 
 def takes_masks(model: Any) -> bool:
     """Whether `predict` takes ``action_masks``, and the agent uses them."""
-    predict = getattr(model.predict, "__func__", model.predict)
-    return "action_masks" in _parameters(predict) and bool(getattr(model, "mask_actions", True))
-
-
-@lru_cache(maxsize=64)
-def _parameters(predict: Callable[..., Any]) -> frozenset[str]:
-    return frozenset(inspect.signature(predict).parameters)
+    takes = "action_masks" in parameters_of(model.__class__, "predict")
+    return takes and bool(getattr(model, "mask_actions", True))
 
 
 # The most input numbers of a network per call, and in total; above, playing episodes is faster than
@@ -101,8 +95,7 @@ def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
         asked = [agent.predict(observations, deterministic=True) for _ in range(2)]
         first, second = (np.asarray(actions) for actions, _ in asked)
     except Exception as error:  # noqa: BLE001  # a stranger's code can fail in any way
-        fails = "act or values fails" if isinstance(agent, PlainAgent) else "predict takes no batch"
-        return f"{fails}: {type(error).__name__}: {error}"
+        return f"asked in all states, it raises {type(error).__name__}: {error}"
     if first.shape != observations.shape[:1]:
         return f"predict returns actions of shape {first.shape} for {len(observations)} states"
     if any(state is not None for _, state in asked):

@@ -310,8 +310,8 @@ def do_study(
         failures |= do_runs(to_do, job.workers, job.command, job.console, job.stop)
     finally:
         if job.stop.number:
-            words, typed = ("compare", "--resume", job.root), study.gym_packages
-            again = job.again or cli.to_copy(*words, typed=typed)
+            typed = study.gym_packages
+            again = job.again or cli.to_copy("compare", "--resume", job.root, typed=typed)
             job.console.print(f"stopped; continue with: {again}")
     from rl_yardstick.experiments.results import read_results
 
@@ -451,7 +451,7 @@ def study_of(algos: Sequence[str], env_ids: Sequence[str]) -> StudySpec:
         for name in names:
             check(name)
         if len(set(names)) < len(names):
-            raise UserError("--env or --algos names one of them twice")
+            raise UserError(f"--env or --algos names {max(names, key=[*names].count)} twice")
     return StudySpec(
         name=file_name(f"{'-'.join(env_ids).replace('/', '-')}_{'-'.join(algos)}"),
         title="",

@@ -15,6 +15,7 @@ from rl_yardstick.envs import checking
 from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.checking import check_transition_model
 from rl_yardstick.envs.warehouse import WarehouseEnv
+from rl_yardstick.envs.wrappers import FlattenToDiscrete
 from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 
 # Where nothing is a question of frequencies, or these are far off.
@@ -35,6 +36,17 @@ class Careless(Corridor):
         return int(uniform < row[1][0])
 
 
+class Shifted(Corridor):
+    """Observes its states as -3 to 1."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = gym.spaces.Discrete(5, start=-3)
+
+    def observe(self):
+        return self.s - 3
+
+
 SAME_REWARDS = outcomes(goal_reward=-1.0)
 # Whether it draws bit for bit as toy_text does, and whether its state can be set.
 RIGHT = {
@@ -42,6 +54,7 @@ RIGHT = {
     "other successors": (lambda: Backwards(SAME_REWARDS, SAME_REWARDS), False, True),
     "the global generators": (Careless, False, True),
     "deaf": (Deaf, True, False),
+    "from -3": (Shifted, True, True),
 }  # fmt: skip
 
 
@@ -51,6 +64,11 @@ def test_right_models_are_believed(name):
     check = check_transition_model(make(), n_steps=FEW)
     assert check.refusal is None
     assert (check.bit_for_bit, check.state_can_be_set) == (bit_for_bit, state_can_be_set)
+
+
+def test_observations_that_do_not_start_at_0():
+    for env, first in ((Shifted(), -3), (FlattenToDiscrete(Shifted()), 0)):
+        assert known.observations_of_states(env).tolist() == [*range(first, first + 5)]
 
 
 def odd(kind=Corridor, **other):
@@ -95,6 +113,7 @@ FALSE = {
     "raises": (lambda: odd(step=raises), "against step, which raised RuntimeError: one two$"),
     "pair": (lambda: odd(observe=lambda env: (0, env.s)),
         r"the observation is \(0, 0\), not the number of a state"),
+    "from 0": (lambda: odd(Shifted, observe=lambda env: env.s), "observed as 0, not -3$"),
     "a short outcome": (
         lambda: Corridor({0: {0: [(1.0,)]}}), "the environment's P is no model"),
     "three actions": (lambda: odd(action_space=gym.spaces.Discrete(3)),
