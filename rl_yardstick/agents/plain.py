@@ -71,9 +71,11 @@ class PlainAgent(OnlineAlgorithm):
         try:
             model_files.encode((self.judged, self._state())[1])  # what fails, fails at the start
         except TypeError as error:
+            if not str(error).startswith("cannot "):  # an error of the user's own code
+                raise
             seen = [frame.f_locals for frame, _ in traceback.walk_tb(error.__traceback__)]
-            keys = [str(at.get("key") or at["pair"][0]) for at in seen if {*at} & {"key", "pair"}]
-            place = ".".join([self.plain.__name__, *keys])
+            at = [x["pair"][0] if "pair" in x else x["key"] for x in seen if {*x} & {"pair", "key"}]
+            place = ".".join(map(str, [self.plain.__name__, *at]))
             raise ValueError(f"{place}: {error}: leave it out, as by __getstate__") from error
 
     def _made(self) -> Any:

@@ -72,8 +72,7 @@ class Claim:
         if isinstance(self.base, BlackjackEnv):
             return blackjack_observations()
         space: Any = self.base.observation_space
-        is_numbered = isinstance(space, gym.spaces.Discrete)
-        return np.arange(space.n) + space.start if is_numbered else None
+        return np.arange(space.n) + space.start if isinstance(space, gym.spaces.Discrete) else None
 
 
 def claim_of(base: Env) -> Claim | None:

@@ -241,9 +241,8 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
             for one in (saved, here)
         )
         if found not in ("", needed):
-            fault = f"of size {found}, and the environment here gives {env.observation_space}"
-            way_out = "give the --env and --env-kwargs of its training"
-            raise UserError(f"{model.path} was trained on observations {fault}: {way_out}")
+            fault = f"of size {found}, not {env.observation_space}: give its --env and --env-kwargs"
+            raise UserError(f"{model.path} was trained on observations {fault}")
         replaced["observation_space"] = env.observation_space
     small = {"buffer_size": 1, "optimize_memory_usage": False}
     extra = small if issubclass(algorithm, OffPolicyAlgorithm) else {}

@@ -290,7 +290,7 @@ REFUSED = [
     (
         (),
         {"algo": "a2c", "env_id": CART},
-        r"trained on observations of size \(8,\), and the environment here gives Box\(.*: give",
+        r"trained on observations of size \(8,\), not Box\(.*: give its --env and",
     ),
     (SAID, {}, "name their file with --vec-normalize"),
     ((*SAID, "vec_normalize.pkl"), {"algo": "dqn"}, "it is no dqn zip: try --algo ppo or a2c$"),
