@@ -158,11 +158,11 @@ def compare(envs: Any, algos: Any, seeds: int = 10, **settings: Any) -> Study:
     classes, it needs another ``name``.
     """
     args = _flags(compare_command, envs, algos, {"seeds": seeds, **settings})
-    study, text = compare_command.study_spec(args), StringIO()
+    study, text, again = compare_command.study_spec(args), StringIO(), "the same call"
     record, root = StudyRecord(study, specs_of(study)), Path(args.log_folder) / study.name
     workers = compare_command.workers_of(args, root, study.run_timeout)
     with _at_work() as work, compare_command.held(root), workers:
-        job = compare_command.Job(root, args.command, *work, workers, not args.no_report)
+        job = compare_command.Job(root, args.command, *work, workers, not args.no_report, again)
         results, _ = compare_command.finished(job, record)
         if results.summary.empty:
             raise UserError(f"no run has finished: {next(iter(results.failures.values()), '')}")
@@ -324,7 +324,7 @@ def _environment(given: Any, is_alone: bool = True) -> tuple[str, dict[str, Any]
         if is_alone or not own:
             return spec.id, own
     if not (is_object or callable(given)):
-        raise UserError(f"an environment is an id, an object or a class, not {shown(given)}")
+        raise UserError(f"an environment is an id, one object or a class, not {shown(given)}")
     for known in gym.registry.values():
         if given in (known.entry_point, *getattr(known.entry_point, "args", ())):
             return known.id, {}
@@ -339,8 +339,10 @@ def _environment(given: Any, is_alone: bool = True) -> tuple[str, dict[str, Any]
 
 def _agent(algo: str | type) -> str:
     """The name of an agent; a class of the user gets one."""
+    if isinstance(algo, str):
+        return algo
     if not isinstance(algo, type):
-        return str(algo)
+        raise UserError(f"an agent is a name or a class, not {shown(algo)}")
     if algo.__module__.partition(".")[0] in ("rl_yardstick", "stable_baselines3", "sb3_contrib"):
         place = f":{algo.__name__}"
         return next(k for k, one in agents.ALGORITHMS.items() if one.entry_point.endswith(place))
@@ -364,6 +366,8 @@ def _at_work(verbose: int = 1) -> Iterator[tuple[TextConsole, Stop]]:
         yield TextConsole(quiet=verbose < 1, **options), Stop().listen()
     except Stopped:
         raise KeyboardInterrupt("stopped at a safe moment") from None
+    except OSError as error:
+        raise UserError(f"{error.filename or 'a file'}: {error.strerror or error}") from error
     finally:
         main.update({name: value for name, value in hidden.items() if value is not None})
         for number, handler in handlers.items():

@@ -97,13 +97,19 @@ def test_an_explanation_is_of_a_run_a_path_or_a_model(run):
         (lambda: ys.train("FrozenLake-v1", "qlearnin"), "did you mean 'qlearning'?"),
         (lambda: ys.train("FrozenLake-v1", "qlearning", gama=1), "did you mean 'gamma'?"),
         (lambda: ys.train("FrozenLake-v1", "qlearning", seed=-3), "--seed: must be a whole number"),
-        (lambda: ys.train(3), "an environment is an id, an object or a class, not 3"),
+        (lambda: ys.train(3), "an environment is an id, one object or a class, not 3"),
+        (lambda: ys.train("CartPole-v1", Line()), "an agent is a name or a class, not <"),
+        (lambda: ys.compare("FrozenLake-v1", [Learner] * 2), "test_api.Learner twice"),
         (lambda: ys.compare("FrozenLake-v1", "ppo", 0), "--seeds: must be a whole number"),
         (lambda: ys.compare("FrozenLake-v1", "ppo", n=1, sed=1), "no hyperparameter 'sed'"),
         (lambda: ys.explain(Line()), "needs its env"),
         (lambda: ys.optimum("CartPole-v1"), "the model of CartPole-v1 is not known"),
         (lambda: ys.Run("nowhere"), "nowhere is no run folder"),
         (lambda: ys.audit("ucb"), "it is for bandits"),
+        (
+            lambda: ys.train("FrozenLake-v1", "random", n=9, folder=__file__),
+            ".py/random: Not a dir",
+        ),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(call, words, tmp_path):
@@ -166,26 +172,36 @@ print(study._repr_html_()[:5], ys.Study(study.folder).table.equals(study.table))
 """
 
 
-def test_classes_of_a_script_train_in_parallel(tmp_path):
+def test_classes_of_a_script_train_in_parallel(tmp_path, typed):
     (tmp_path / "script.py").write_text(SCRIPT)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     printed = subprocess.check_output([sys.executable, "script.py"], env=environment, text=True)
     assert printed.count("begun") == 1
     assert "\n4 Chance random None " in printed
     assert printed.endswith("<pre> True\n")
+    code, _, err = typed("compare.py", "--resume", "logs/studies/Mine-v0_Chance-random")
+    assert (code, err.count("\n"), "the same call of compare there continues" in err) == (
+        2,
+        1,
+        True,
+    )
 
 
-def test_an_interrupt_ends_at_a_safe_moment_and_leaves_no_handler():
+def test_an_interrupt_ends_at_a_safe_moment_and_leaves_no_handler(monkeypatch, capsys):
+    def do_runs(runs, workers, command, console, stop):
+        signal.raise_signal(signal.SIGINT)
+        stop.check()
+
     def interrupted():
-        with api._at_work() as (_, stop):
-            signal.raise_signal(signal.SIGINT)
-            stop.check()
+        ys.compare("FrozenLake-v1", "random", 1, n_timesteps=20)
 
+    monkeypatch.setattr("rl_yardstick.experiments.pool.do_runs", do_runs)
     before = signal.getsignal(signal.SIGINT), vars(sys.modules["__main__"]).get("__file__")
     with pytest.raises(KeyboardInterrupt, match="stopped at a safe moment"):
         interrupted()
     after = signal.getsignal(signal.SIGINT), vars(sys.modules["__main__"]).get("__file__")
     assert before == after
+    assert "stopped; continue with: the same call" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -37,7 +37,7 @@ def fault_of(cls: Any) -> str:
     if is_plain(cls) and lacks:
         has = [name for name in dir(cls) if not name.startswith("_")]
         return f"lacks {' and '.join(lacks)}; it has {', '.join(has) or 'no methods'}"
-    for name in [name for name in _METHODS if is_plain(cls) and hasattr(cls, name)]:
+    for name in [one for one in _METHODS if is_plain(cls) and getattr(cls, one, None) is not None]:
         known, given = parameters_of(cls, name), _METHODS[name].split()
         signature = inspect.Signature([*known.values()])
         try:

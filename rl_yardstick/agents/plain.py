@@ -7,6 +7,7 @@ import hmac
 import inspect
 import pickle
 import random
+import traceback
 from copy import deepcopy
 from functools import cache, cached_property
 from typing import Any, ClassVar, Self
@@ -21,7 +22,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 from rl_yardstick.agents.common import model_files
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm, Transitions
-from rl_yardstick.agents.own_classes import hyperparameters_of, parameters_of
+from rl_yardstick.agents.own_classes import GIVEN, hyperparameters_of, parameters_of
 from rl_yardstick.mdp.transition_model import Floats
 
 
@@ -65,7 +66,15 @@ class PlainAgent(OnlineAlgorithm):
             set_random_seed(self.seed)  # the global generators, which the user's class may use
         self.policy.owner = self
         self.agent = self._made()
-        _ = self.judged, self._state()  # what fails, fails at the start
+        try:
+            model_files.encode((self.judged, self._state())[1])  # what fails, fails at the start
+        except TypeError as error:
+            if not str(error).startswith("cannot "):  # an error of the user's own code
+                raise
+            seen = [frame.f_locals for frame, _ in traceback.walk_tb(error.__traceback__)]
+            at = [x["pair"][0] if "pair" in x else x["key"] for x in seen if {*x} & {"pair", "key"}]
+            place = ".".join(map(str, [self.plain.__name__, *at]))
+            raise ValueError(f"{place}: {error}: leave it out, as by __getstate__") from error
 
     def _made(self) -> Any:
         seen, done, outside = self.observation_space, self.action_space, gym.Env[Any, Any]()
@@ -73,7 +82,11 @@ class PlainAgent(OnlineAlgorithm):
         given = {"observation_space": seen, "action_space": done, "seed": self.seed, "env": outside}
         given |= {"n_states": getattr(seen, "n", None), "n_actions": getattr(done, "n", None)}
         kept = {name: given[name] for name in given if name in parameters_of(self.plain)}
-        return self.plain(**kept, **self.hyperparams)
+        own, given = hyperparameters_of(self.plain), self.hyperparams
+        if lacks := [k for k, one in own.items() if one.default is one.empty and k not in given]:
+            ways = f"give -params {lacks[0]}:VALUE; filled in are {', '.join(GIVEN)}"
+            raise ValueError(f"{self.plain.__name__} needs {', '.join(lacks)}: {ways}")
+        return self.plain(**kept, **given)
 
     # --- acting and learning ----------------------------------------------------------------------
 
@@ -93,12 +106,14 @@ class PlainAgent(OnlineAlgorithm):
 
     def values_at(self, rows: list[Any]) -> Floats | None:
         """Its values at n observations, shape (n, A) or (n,); None without ``values``."""
-        if not hasattr(self.plain, "values"):
+        if not callable(getattr(self.plain, "values", None)):
             return None
         values = np.array([self.judged.values(row) for row in rows], dtype=np.float64)
-        n = getattr(self.action_space, "n", 0)  # of actions
-        if values.shape[1:] not in ((), (n,)) or np.isnan(values).any():
-            raise ValueError(f"{self.plain.__name__}.values(obs) is not one number, or {n} of them")
+        n, name = getattr(self.action_space, "n", 0), f"{self.plain.__name__}.values(obs)"
+        if values.shape[1:] not in ((), (n,)):
+            raise ValueError(f"{name} is not one number, or {n} of them")
+        if np.isnan(values).any():
+            raise ValueError(f"{name} is NaN for an observation")
         return values
 
     def as_array(self, action: Any) -> NDArray[Any]:
@@ -108,7 +123,8 @@ class PlainAgent(OnlineAlgorithm):
             found = np.asarray(action, dtype=space.dtype).reshape(space.shape)
             action = np.clip(found, space.low, space.high)
         if not space.contains(action):
-            raise ValueError(f"{self.plain.__name__}.act returned {action!r}, not in {space}")
+            hint = ": return int(...)" if space.shape == () and type(action) is not int else ""
+            raise ValueError(f"{self.plain.__name__}.act returned {action!r}, not in {space}{hint}")
         return np.asarray(action, dtype=space.dtype)
 
     def _choose_actions(self) -> NDArray[Any]:
@@ -146,7 +162,11 @@ class PlainAgent(OnlineAlgorithm):
         """Why its greedy actions are no function of observations; empty if they are one."""
         kept = []
         for part in (observations, observations[::-1]):  # the first may make rows of a table
-            actions, _ = self.predict(part, deterministic=True)
+            try:
+                actions, _ = self.predict(part, deterministic=True)
+            except AttributeError:  # of what `reset` sets
+                self.judged.reset()
+                actions, _ = self.predict(part, deterministic=True)
             generators = random.getstate(), np.random.get_state()  # noqa: NPY002
             kept.append((actions, cloudpickle.dumps((self.judged, generators))))
         if np.array_equal(kept[0][0], kept[1][0][::-1]) and kept[0][1] == kept[1][1]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -20,6 +19,7 @@ from rl_yardstick.agents.bandits.tables import ValueBandit
 from rl_yardstick.agents.common.exploration import BOLTZMANN
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm, tiles_of_all, vectors_of
 from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
+from rl_yardstick.agents.own_classes import parameters_of
 from rl_yardstick.agents.plain import PlainAgent, rows_of
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
@@ -48,7 +48,7 @@ def has_memory(agent: BaseAlgorithm) -> bool:
 
 def takes_masks(model: Any) -> bool:
     """Whether `predict` takes ``action_masks``, and the agent uses them."""
-    takes = "action_masks" in inspect.signature(model.predict).parameters
+    takes = "action_masks" in parameters_of(model.__class__, "predict")
     return takes and bool(getattr(model, "mask_actions", True))
 
 
@@ -73,7 +73,7 @@ def obstacle(
     n_states = len(observations)
     if reason := _cannot_be_asked(agent, masks):
         return reason
-    if is_network(agent) and n_states * _n_inputs(agent) > MOST_NUMBERS:
+    if is_network(agent) and n_states * spaces.flatdim(agent.observation_space) > MOST_NUMBERS:
         return f"querying a network in {n_states:,} states takes longer than playing"
     if isinstance(agent, PlanningAgent):
         if agent.policy.is_stationary or n_states * horizon <= MOST_PLANNED:
@@ -95,7 +95,7 @@ def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
         asked = [agent.predict(observations, deterministic=True) for _ in range(2)]
         first, second = (np.asarray(actions) for actions, _ in asked)
     except Exception as error:  # noqa: BLE001  # a stranger's code can fail in any way
-        return f"predict takes no batch of observations ({type(error).__name__})"
+        return f"asked in all states, it raises {type(error).__name__}: {error}"
     if first.shape != observations.shape[:1]:
         return f"predict returns actions of shape {first.shape} for {len(observations)} states"
     if any(state is not None for _, state in asked):
@@ -199,18 +199,14 @@ def _in_parts(
 ) -> NDArray[Any]:
     """Call ``asked`` on batches of observations that a network can take."""
     n_states = len(observations)
-    n_rows = max(MOST_AT_ONCE // _n_inputs(agent), 1) if is_network(agent) else n_states
+    n_inputs = max(spaces.flatdim(agent.observation_space), 1)
+    n_rows = max(MOST_AT_ONCE // n_inputs, 1) if is_network(agent) else n_states
     told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
     if n_states <= n_rows:
         return asked(observations, **told)
     parts = [slice(i, i + n_rows) for i in range(0, n_states, n_rows)]
     found = [asked(observations[p], **{name: m[p] for name, m in told.items()}) for p in parts]
     return np.concatenate(found)
-
-
-def _n_inputs(agent: BaseAlgorithm) -> int:
-    """The size of a flattened observation."""
-    return max(int(spaces.flatdim(agent.observation_space)), 1)
 
 
 def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:

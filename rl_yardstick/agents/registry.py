@@ -83,6 +83,12 @@ class AlgorithmEntry:
             if type(space).__name__ not in known:
                 size = table_size(observation_space, action_space) if self.numbers_spaces else ""
                 return f"it {role} {' or '.join(known)} spaces, not {space}{size}"
+            # Networks of Stable-Baselines3 send fractions, and take vectors and images.
+            is_odd = isinstance(space, spaces.MultiDiscrete) and len(space.shape) > 1
+            if isinstance(space, spaces.Box):
+                is_odd = space.shape == () or (role == "acts in" and space.dtype.kind != "f")
+            if is_odd and self.entry_point.startswith(_NETWORKS):
+                return f"it {role} no {space}"
             # The one-hot encoding of Stable-Baselines3 and every table count from zero.
             if not counts_from_zero(space):
                 wrapper = "TransformObservation" if role == "observes" else "TransformAction"
@@ -146,6 +152,7 @@ def _family(
 
 
 OURS = "rl_yardstick.agents."
+_NETWORKS = "stable_baselines3:", "sb3_contrib:", f"{OURS}library:", f"{OURS}random_search:"
 _tabular = _family(f"{OURS}tabular.", DISCRETE, DISCRETE, engines=TABLE_ENGINES)
 _tiled = _family(f"{OURS}linear.", LINEAR_INPUTS, DISCRETE, engines=TABLE_ENGINES)
 _network = _family(f"{OURS}library:", NETWORK_INPUTS, DISCRETE, engines=LIBRARY_ENGINES)

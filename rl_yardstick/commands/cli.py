@@ -53,8 +53,9 @@ def called_as(command: str) -> str:
     return f"python {shlex.quote(str(beside))}"
 
 
-def to_copy(command: str, *words: object) -> str:
-    """A command to copy into a shell; a long one goes on behind backslashes."""
+def to_copy(command: str, *words: object, typed: Sequence[str] = ()) -> str:
+    """A command to copy into a shell, with the modules that were typed; a long one is wrapped."""
+    words = (*words, "--gym-packages", *typed) if typed else words
     quoted = [shlex.quote(str(word)).replace(" ", "\0") for word in words]
     whole: Any = {"break_long_words": False, "break_on_hyphens": False}
     lines = textwrap.wrap(" ".join([called_as(command), *quoted]), 74, **whole)
@@ -267,18 +268,13 @@ def import_typed(args: argparse.Namespace) -> None:
     """
     from rl_yardstick.pipeline.components import agent_name, import_modules, split_id
 
-    env = getattr(args, "env", None)
-    ids = env if isinstance(env, list) else [env or ""]
-    found = [split_id(env_id) for env_id in ids]
-    args.gym_packages = [*args.gym_packages, *(module for module, _ in found if module)]
-    names = [name for _, name in found]
-    args.env = names if isinstance(env, list) else names[0]
-    for key in [key for key in ("algo", "algos") if getattr(args, key, None)]:
-        algos = getattr(args, key)
-        words = algos if isinstance(algos, list) else [algos]
-        args.gym_packages = [*args.gym_packages, *(word for word in words if ":" in word)]
-        names = [*map(agent_name, words)]
-        setattr(args, key, names if isinstance(algos, list) else names[0])
+    for key in [key for key in ("env", "algo", "algos") if getattr(args, key, None)]:
+        given = getattr(args, key)
+        words = given if isinstance(given, list) else [given]
+        typed = [split_id(word)[0] if key == "env" else word for word in words if ":" in word]
+        args.gym_packages = [*args.gym_packages, *filter(None, typed)]
+        names = [split_id(word)[1] if key == "env" else agent_name(word) for word in words]
+        setattr(args, key, names if isinstance(given, list) else names[0])
     import_modules(args.gym_packages)
 
 

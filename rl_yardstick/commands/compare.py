@@ -193,6 +193,7 @@ class Job:
     stop: Stop
     workers: Workers
     with_page: bool = True  #: draw the figures and write the page, beside the tables
+    again: str = ""  #: what continues after a signal, if it is no command
 
 
 @contextmanager
@@ -283,7 +284,7 @@ def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
         words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
         runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
         fault = f"{root}: {runs} other settings ({words})"
-        raise UserError(f"{fault}: give the study another folder, by --name or -f")
+        raise UserError(f"{fault}: give the study another folder by --name NAME")
 
 
 def do_study(
@@ -309,7 +310,8 @@ def do_study(
         failures |= do_runs(to_do, job.workers, job.command, job.console, job.stop)
     finally:
         if job.stop.number:
-            again = cli.to_copy("compare", "--resume", job.root)
+            typed = study.gym_packages
+            again = job.again or cli.to_copy("compare", "--resume", job.root, typed=typed)
             job.console.print(f"stopped; continue with: {again}")
     from rl_yardstick.experiments.results import read_results
 
@@ -352,7 +354,8 @@ def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
 
     print_analysis(console, analysis)
     if failed := worst_failed_run(results):
-        console.print(f"why the worst run failed: {cli.to_copy('explain', failed)}")
+        typed = results.study.gym_packages
+        console.print(f"why the worst run failed: {cli.to_copy('explain', failed, typed=typed)}")
     with console.status("writing the tables"):
         files = [*write_tables(results), *write_verdicts(analysis, job.command)]
     if width:
@@ -448,7 +451,7 @@ def study_of(algos: Sequence[str], env_ids: Sequence[str]) -> StudySpec:
         for name in names:
             check(name)
         if len(set(names)) < len(names):
-            raise UserError("--env or --algos names one of them twice")
+            raise UserError(f"--env or --algos names {max(names, key=[*names].count)} twice")
     return StudySpec(
         name=file_name(f"{'-'.join(env_ids).replace('/', '-')}_{'-'.join(algos)}"),
         title="",

@@ -139,7 +139,7 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
                 outcome = train(spec, run, resumes, print_engine)
         except Stopped:
             if run.has_begun:
-                again = cli.to_copy("train", "--resume", run.path)
+                again = cli.to_copy("train", "--resume", run.path, typed=args.gym_packages)
                 run.console.print(f"stopped; resume with: {again}")
             raise
         if not run.console.quiet:
@@ -414,15 +414,14 @@ def next_commands(run: Run, spec: TrainSpec, explained: bool, args: Any) -> list
     """Commands to type next, in the working directory of the training."""
     from rl_yardstick.report.catalogue import rival
 
-    more = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
-    labels = ("watch    ", "enjoy"), ("explain  ", "explain")
-    told = [f"{label}{cli.to_copy(name, run.path, *more)}" for label, name in labels]
+    labels, typed = (("watch    ", "enjoy"), ("explain  ", "explain")), args.gym_packages
+    told = [f"{label}{cli.to_copy(name, run.path, typed=typed)}" for label, name in labels]
     told = told[: 1 + explained]
     if spec.env_kwargs and not args.env_kwargs:  # of a file, or typed before the run was resumed
         return told
-    more += ["--env-kwargs", *args.env_kwargs] if args.env_kwargs else []
+    more = ["--env-kwargs", *args.env_kwargs] if args.env_kwargs else []
     more += ["--n-timesteps", args.n_timesteps] if args.n_timesteps > 0 else []
     more += ["--n-episodes", args.n_episodes] if args.n_episodes > 0 else []
     more += ["--conf-file", f"{spec.algo}:{args.conf_file}"] if args.conf_file else []
     words = ["--env", spec.env_id, "--algos", spec.algo, rival(spec), *more]
-    return [*told, f"compare  {cli.to_copy('compare', *words)}"]
+    return [*told, f"compare  {cli.to_copy('compare', *words, typed=typed)}"]

@@ -71,10 +71,8 @@ class Claim:
             return np.asarray(self.base.observation_of(np.arange(self.model.n_states)))
         if isinstance(self.base, BlackjackEnv):
             return blackjack_observations()
-        space = self.base.observation_space
-        if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
-            return None
-        return np.arange(space.n)
+        space: Any = self.base.observation_space
+        return np.arange(space.n) + space.start if isinstance(space, gym.spaces.Discrete) else None
 
 
 def claim_of(base: Env) -> Claim | None:

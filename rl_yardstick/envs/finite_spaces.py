@@ -143,7 +143,7 @@ def table_size(observations: Space, actions: Space) -> str:
     except ValueError:
         return ""
     needed = 8e-9 * float(n_states) * float(n_actions)
-    return f" (a table of {n_states:.3g} x {n_actions} needs {needed:,.0f} GB)"
+    return f" of this size (a table of {n_states:.3g} x {n_actions} needs {needed:,.0f} GB)"
 
 
 def describe(space: Space) -> str:

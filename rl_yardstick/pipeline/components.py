@@ -29,7 +29,7 @@ import gymnasium as gym
 from pydantic import Field, TypeAdapter, ValidationError
 
 from rl_yardstick.agents.own_classes import SMALLEST
-from rl_yardstick.agents.registry import BY_VALUE, add_class
+from rl_yardstick.agents.registry import ALGORITHMS, BY_VALUE, add_class
 from rl_yardstick.pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
@@ -71,11 +71,12 @@ def import_modules(typed: Iterable[str]) -> None:
         except UserError:
             raise
         except ModuleNotFoundError as error:
-            raise UserError(f"--gym-packages {name}: no module named {error.name}") from error
+            raise UserError(f"{name}: no module named {error.name}") from error
         except (Exception, SystemExit) as error:  # an import may raise anything
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            place = f"{last.filename}:{last.lineno}"
-            raise UserError(f"--gym-packages {name}: {place}: {one_line(error)}") from error
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            at: Any = error if isinstance(error, SyntaxError) else frame
+            what = f"{at.filename}:{at.lineno}: {type(error).__name__}: {one_line(error)}"
+            raise UserError(f"{name}: {what}") from error
 
 
 def split_class(typed: str) -> tuple[str, str]:
@@ -143,7 +144,10 @@ def digests_of(typed: Iterable[str], *names: str) -> dict[str, str]:
 
 
 def check_code(spec: TrainSpec, where: str) -> None:
-    """Raise UserError if the user's modules have changed since a training was begun."""
+    """Raise UserError if the user's classes are not there, or have changed since a training."""
+    if spec.algo not in ALGORITHMS or spec.env_id not in gym.registry:
+        fault = "was begun in Python, with classes of a script or notebook"
+        raise UserError(f"{where} {fault}: the same call of compare there continues a study")
     here = digests_of(spec.gym_packages)
     if changed := [name for name in here if spec.code.get(name, here[name]) != here[name]]:
         raise UserError(f"{where} was begun with other code of {', '.join(changed)}")

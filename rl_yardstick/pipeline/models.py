@@ -170,7 +170,7 @@ def zip_data(path: Path) -> dict[str, Any]:
     try:
         return first_look(content)
     except ValueError as error:
-        raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
+        raise UserError(f"{path} is no agent's zip: it {one_line(error)}") from error
 
 
 def _spec_of(path: Path, data: Mapping[str, Any], wanted: Wanted) -> TrainSpec:
@@ -241,11 +241,8 @@ def load_agent(model: Model, env: VecEnv | None = None) -> BaseAlgorithm:
             for one in (saved, here)
         )
         if found not in ("", needed):
-            fault = f"{found}, and the environment here gives shape {needed}"
-            raise UserError(
-                f"{model.path} was trained on observations of shape {fault}: give the right "
-                "--env-kwargs"
-            )
+            fault = f"of size {found}, not {env.observation_space}: give its --env and --env-kwargs"
+            raise UserError(f"{model.path} was trained on observations {fault}")
         replaced["observation_space"] = env.observation_space
     small = {"buffer_size": 1, "optimize_memory_usage": False}
     extra = small if issubclass(algorithm, OffPolicyAlgorithm) else {}
@@ -277,6 +274,8 @@ def load(spec: TrainSpec, path: Path, env: VecEnv | None, **replaced: Any) -> Ba
         key, way_out = getattr(error, "key", None), ""
         if key in ("policy_class", "policy_kwargs", "replay_buffer_class", "rollout_buffer_class"):
             way_out = "; to admit a class of yours, name its module: --gym-packages MODULE"
+            if "ActorCriticPolicy" in str(error):
+                way_out = f"; it is no {spec.algo} zip: try --algo ppo or a2c"
         elif key in arguments_of(spec.algo):
             way_out = f"; train.py -i continues with another value: -params {key}:VALUE"
         what = f"{path} cannot be loaded as a {spec.algo} agent: {one_line(error)}"

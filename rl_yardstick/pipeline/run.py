@@ -125,7 +125,7 @@ class Run:
         try:
             return TrainSpec.model_validate(self.recorded()["spec"])
         except (ValidationError, LookupError, TypeError) as error:
-            fault = f"is no run folder of this version: {RECORD} has no spec"
+            fault = f"is no run folder of this version: it has no {RECORD} with a spec"
             raise UserError(f"{self.path} {fault}") from error
 
     def begin(self, spec: TrainSpec, args: Mapping[str, Any], command: str) -> None:

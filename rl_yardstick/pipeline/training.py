@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -189,12 +190,7 @@ class Training:
                 self.progress.read_clock()
         except OF_LIBRARIES as e:
             check_model(agent)  # PyTorch's error for nan in distributions is obscure
-            raised_in = traceback.extract_tb(e.__traceback__)[-1].filename
-            ours = "site-packages", str(Path(rl_yardstick.__file__).parent)
-            if not any(place in raised_in for place in ours):
-                raise
-            when = f"{spec.title}, at step {agent.num_timesteps:,}"
-            raise UserError(f"{when}: {one_line(e)}") from e
+            raise told(e, f"{spec.title}, at step {agent.num_timesteps:,}")  # noqa: B904
         finally:
             self.progress.bar.stop()
 
@@ -242,6 +238,14 @@ class Training:
         }
 
 
+def told(error: Exception, where: str) -> Exception:
+    """An error of the user's own code as it is, any other in one line."""
+    raised_in = traceback.extract_tb(error.__traceback__)[-1].filename
+    ours = "site-packages", str(Path(rl_yardstick.__file__).parent)
+    is_ours = any(place in raised_in for place in ours) and not isinstance(error, UserError)
+    return UserError(f"{where}: {one_line(error)}") if is_ours else error
+
+
 def numbered_spaces(agent: Any) -> Iterator[str]:
     """A line for each space whose members the agent numbers."""
     original = getattr(agent, "original_spaces", None) or ()
@@ -267,15 +271,11 @@ def make_agent(spec: TrainSpec, folder: Path | None, appending: bool = False) ->
             "tensorboard_log": None if log is None else str(log),
             **action_noise(spec, env.action_space),
         }
-        is_new = spec.trained_agent is None
-        agent: BaseAlgorithm = (
-            algorithm(env=env, **arguments) if is_new else load_to_train(spec, env, **arguments)
-        )
+        made = algorithm if spec.trained_agent is None else partial(load_to_train, spec)
+        agent: BaseAlgorithm = made(env=env, **arguments)
     except (UserError, *REFUSALS) as error:
         env.close()
-        if isinstance(error, UserError):
-            raise
-        raise UserError(f"{spec.algo} on {spec.place}: {one_line(error)}") from error
+        raise told(error, f"{spec.algo} on {spec.place}")  # noqa: B904
     if log is None and not spec.library_log:
         agent.set_logger(Logger(folder=None, output_formats=[]))
     elif log is not None and appending:

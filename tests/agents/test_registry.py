@@ -73,6 +73,7 @@ def test_which_agents_fit(env_id, names):
 ANY = "Box or Discrete or MultiDiscrete or MultiBinary"
 MIXED = spaces.Dict(at=BOX, to=FROM_ONE)
 NOT_ZERO = "it needs Discrete spaces that start at 0, not"
+TABLES = "it observes Discrete spaces"
 MISFITS = [  # agent, observations, actions, and why it does not fit
     ("qlearning", DISCRETE, DISCRETE, ""),
     ("angle", BOX, spaces.Discrete(2), ""),
@@ -82,10 +83,13 @@ MISFITS = [  # agent, observations, actions, and why it does not fit
     ("ppo", spaces.Tuple([DISCRETE]), DISCRETE,
      f"it observes {ANY} or Dict spaces, not Tuple(Discrete(4))"),
     ("optimal", spaces.Box(0, 9, (9,), np.uint8), spaces.Discrete(2),
-     "it observes Discrete spaces, not Box(0, 9, (9,), uint8) (a table of 1e+09 x 2 needs 16 GB)"),
+     f"{TABLES}, not Box(0, 9, (9,), uint8) of this size (a table of 1e+09 x 2 needs 16 GB)"),
     ("dqn", spaces.Discrete(4, start=1), DISCRETE, f"{NOT_ZERO} Discrete(4, start=1)"),
     ("ppo", BOX, FROM_ONE, f"{NOT_ZERO} MultiDiscrete([2 2], start=[1 0])"),
     ("a2c", MIXED, DISCRETE, f"{NOT_ZERO} {MIXED}: shift it by Gymnasium's TransformObservation"),
+    ("ppo", BOX, spaces.Box(-1, 0, (2,), np.int64), "it acts in no Box(-1, 0, (2,), int64)"),
+    ("ppo", spaces.Box(0, 9, (), np.int32), DISCRETE, "it observes no Box(0, 9, (), int32)"),
+    ("dqn", spaces.MultiDiscrete([[2, 3]]), DISCRETE, "it observes no MultiDiscrete([[2 3]])"),
     ("angle", spaces.Box(-1, 1, (2,)), DISCRETE,
      "it needs observations of shape (4,), not (2,)"),
 ]  # fmt: skip

@@ -167,7 +167,8 @@ def test_the_same_command_does_what_is_left(number, typed, own_folder, begun):
         assert process.returncode == -number
     else:
         assert (process.returncode, err) == (128 + number, "")
-        assert f"stopped; continue with: python {COMPARE} --resume studies/Walk-v0_qlearning" in out
+        hint = f"stopped; continue with: python {COMPARE} --resume studies/Walk-v0_qlearning "
+        assert f"{hint}--gym-packages walks" in " ".join(out.replace("\\\n", "").split())
         assert states(study) == ["interrupted"] * 2
     (own_folder / "mark").touch()
     begun_at = {path: path.stat().st_mtime_ns for path in study.glob("runs/*/*/0.monitor.csv")}

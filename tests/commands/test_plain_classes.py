@@ -64,6 +64,13 @@ class Net(Base):  # says itself what a zip holds
         return {"q": self.q}
     def load_state_dict(self, state):
         self.q = state["q"]
+class Begun(Base):  # it can act from its first episode on
+    values = None
+    def learn(self, *transition): ...
+    def reset(self):
+        self.action = 1
+    def act(self, obs):
+        return self.action
 class Mine(DQN): ...
 class Asked:
     def get_action(self, obs): ...
@@ -72,8 +79,21 @@ class Short:
     def learn(self, obs, action, reward): ...
 class Outside(Base):
     def act(self, obs): return 7
+class Half(Base):
+    def act(self, obs): return 0.0
+class Void(Table):
+    def values(self, obs): return self.q[obs] + np.nan
 class Needs(Table):
     def __init__(self, alpha): ...
+class Open(Table):
+    def __init__(self, n_states, n_actions, seed):
+        super().__init__(n_states, n_actions, seed)
+        self.log = open("mine.py")
+class Kept(Net):
+    def state_dict(self):
+        return {"q": self.q, "f": lambda: 0}
+class Fails(Table):
+    def __init__(self): raise RuntimeError("no table")
 number = 3
 """
 CELL = """
@@ -87,6 +107,8 @@ class Cell:
 def module(own_folder, monkeypatch):
     """The user's module."""
     (own_folder / "mine.py").write_text(MODULE)
+    (own_folder / "broken.py").write_text("def act(self obs): ...")
+    (own_folder / "broken2.py").write_text("1 / 0")
     monkeypatch.setattr(sys, "path", [*sys.path])
 
 
@@ -165,13 +187,14 @@ def test_it_goes_on_bit_for_bit_and_its_zip_holds_its_state(cls, form, monkeypat
 
 def test_it_is_judged_as_it_acts_unless_it_says_how_to_act_without_exploring():
     found = {}
-    for cls in ("Table", "Lazy", "Net"):
+    for cls in ("Table", "Lazy", "Net", "Begun"):
         _, done = run_of(spec_for(cls, 60))
         found[cls] = done.final.is_exact
     del sys.modules["mine"].Base.values
     parameters_of.cache_clear()
     _, done = run_of(spec_for("Table", 60))
-    assert (found, done.final.is_exact) == ({"Table": True, "Lazy": False, "Net": True}, False)
+    is_exact = {"Table": True, "Lazy": False, "Net": True, "Begun": True}
+    assert (found, done.final.is_exact) == (is_exact, False)
 
 
 @pytest.mark.parametrize(
@@ -182,8 +205,14 @@ def test_it_is_judged_as_it_acts_unless_it_says_how_to_act_without_exploring():
         ("mine:number", "mine.number is no class, but of type int"),
         ("mine:Asked", "mine.Asked lacks act and learn; it has get_action"),
         ("./mine.py:Short", "has learn(obs, action, reward), which does not take (obs, action,"),
-        ("mine:Needs", "missing 1 required positional argument: 'alpha'"),
+        ("mine:Needs", "Needs needs alpha: give -params alpha:VALUE; filled in are observation"),
+        ("mine:Open", "Open.log: cannot pickle '_io.TextIOWrapper' object: leave it out"),
+        ("mine:Kept", "Kept.state_dict.f: cannot be written as JSON: builtins.function: leave"),
+        ("broken:Agent", "broken.py:1: SyntaxError: "),
+        ("broken2:Agent", "broken2.py:1: ZeroDivisionError: division by zero"),
         ("mine:Outside", "at step 0: Outside.act returned 7, not in Discrete(4)"),
+        ("mine:Half", "Half.act returned 0.0, not in Discrete(4): return int(...)"),
+        ("mine:Void", "at step 1: Void.values(obs) is NaN for an observation"),
         ("mine.Table", "unknown agent 'mine.Table'"),
     ],
 )
@@ -192,7 +221,12 @@ def test_what_is_no_agent_is_refused(type_in_own_folder, own_folder, name, words
     assert code == 2
     assert words in err.splitlines()[0]
     assert ("class MyAgent:\n    def act(self, obs):\n" in err) == (err.count("\n") > 1)
-    assert (own_folder / "logs").exists() == (name == "mine:Outside")  # it has begun
+    assert (own_folder / "logs").exists() == (name in ("mine:Outside", "mine:Half", "mine:Void"))
+
+
+def test_an_error_of_its_constructor_goes_through():
+    with pytest.raises(RuntimeError, match="no table"):
+        run_of(spec_for("Fails", 20))
 
 
 def test_commands_take_it(type_in_own_folder, own_folder, in_this_process):

@@ -163,19 +163,21 @@ def test_scripts_that_a_queue_starts_again(type_command, tmp_path):
 
 def test_a_signal_ends_a_command_and_tells_how_to_resume(type_command, tmp_path):
     """The other one is sent to a study, see ``test_compare_command.py``."""
-    words = [sys.executable, TRAIN, "--env", "CartPole-v1", "--algo", "ppo", "-n", "10000000"]
+    typed = ["--gym-packages", "math"]
+    words = [sys.executable, TRAIN, "--env", "CartPole-v1", "--algo", "ppo", "-n", "1e7", *typed]
     process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     state = tmp_path / "logs/ppo/CartPole-v1_1/state.bin"
     begun = time.monotonic()
     while not state.exists() and time.monotonic() - begun < 200:
         time.sleep(0.1)
-    code, _, err = type_command("train.py", "--resume", state.parent)
+    code, _, err = type_command("train.py", "--resume", state.parent, *typed)
     assert (code, err.count("\n")) == (2, 1)
     assert f"is in use by another command, process {process.pid}" in err
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=100)
     assert process.returncode == 128 + signal.SIGTERM
-    assert f"stopped; resume with: python {TRAIN} --resume logs/ppo/CartPole-v1_1" in out
+    hint = f"stopped; resume with: python {TRAIN} --resume logs/ppo/CartPole-v1_1 {' '.join(typed)}"
+    assert hint in " ".join(out.replace("\\\n", "").split())
     record = json.loads((state.parent / "run.json").read_text())
     assert (record["state"], record["stopped_by"]) == ("interrupted", signal.SIGTERM)
     assert (state.parent / "CartPole-v1.zip").exists()

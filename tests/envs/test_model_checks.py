@@ -15,6 +15,7 @@ from rl_yardstick.envs import checking
 from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.checking import check_transition_model
 from rl_yardstick.envs.warehouse import WarehouseEnv
+from rl_yardstick.envs.wrappers import FlattenToDiscrete
 from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 
 # Where nothing is a question of frequencies, or these are far off.
@@ -35,6 +36,17 @@ class Careless(Corridor):
         return int(uniform < row[1][0])
 
 
+class Shifted(Corridor):
+    """Observes its states as -3 to 1."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = gym.spaces.Discrete(5, start=-3)
+
+    def observe(self):
+        return self.s - 3
+
+
 SAME_REWARDS = outcomes(goal_reward=-1.0)
 # Thirds that do not sum to 1 in single precision.
 THIRDS = {
@@ -48,6 +60,7 @@ RIGHT = {
     "the global generators": (Careless, False, True),
     "deaf": (Deaf, True, False),
     "thirds": (lambda: Corridor(THIRDS, THIRDS), True, True),
+    "from -3": (Shifted, True, True),
 }  # fmt: skip
 
 
@@ -57,6 +70,11 @@ def test_right_models_are_believed(name):
     check = check_transition_model(make(), n_steps=FEW)
     assert check.refusal is None
     assert (check.bit_for_bit, check.state_can_be_set) == (bit_for_bit, state_can_be_set)
+
+
+def test_observations_that_do_not_start_at_0():
+    for env, first in ((Shifted(), -3), (FlattenToDiscrete(Shifted()), 0)):
+        assert known.observations_of_states(env).tolist() == [*range(first, first + 5)]
 
 
 def odd(kind=Corridor, **other):
@@ -105,6 +123,7 @@ FALSE = {
         r"^the environment's P is no model: state 0, action 0: an outcome is \(probab"),
     "by pairs": (lambda: Corridor({(s, 0): [] for s in range(5)}),
         "P must map states, the numbers 0 to 4, to mappings of actions; it begins with"),
+    "from 0": (lambda: odd(Shifted, observe=lambda env: env.s), "observed as 0, not -3$"),
     "three actions": (lambda: odd(action_space=gym.spaces.Discrete(3)),
         r"P is no model: it has 2 actions, where the space is Discrete\(3\)$"),
 }  # fmt: skip

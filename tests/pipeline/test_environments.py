@@ -270,8 +270,8 @@ def test_modules_that_were_typed(own_folder, monkeypatch, how):
 def test_modules_that_cannot_be_imported(own_folder, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     for text, typed, said in (
-        ("x = 1\nraise ValueError('no')\n", "failing", r"failing\.py:2: no"),
-        ("raise SystemExit(3)\n", "leaving.py", r"leaving\.py:1: 3"),
+        ("x = 1\nraise ValueError('no')\n", "failing", r"failing\.py:2: ValueError: no"),
+        ("raise SystemExit(3)\n", "leaving.py", r"leaving\.py:1: SystemExit: 3"),
     ):
         (own_folder / typed).with_suffix(".py").write_text(text)
         with pytest.raises(UserError, match=said):

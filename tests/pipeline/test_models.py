@@ -72,13 +72,13 @@ def test_which_model_of_which_run(tmp_path):
         (Wanted(algo="dqn", log_folder=tmp_path), "no run of dqn on CartPole-v1"),
         (Wanted(algo="dnq", log_folder=tmp_path), "unknown agent 'dnq'"),
         (Wanted(tmp_path / "none.zip"), r"none\.zip: no such file"),
-        (Wanted(runs[0].path / "run.json"), "is no whole zip of an agent"),
+        (Wanted(runs[0].path / "run.json"), "run.json is no agent's zip: it is no whole zip: "),
         (Wanted(runs[0].path / "best_model.zip", which="best"), "is one model"),
     ):
         with pytest.raises(UserError, match=said):
             find_model(wanted)
     (runs[0].path / "run.json").write_text("{}")
-    with pytest.raises(UserError, match=r"no run folder of this version: run\.json has no spec"):
+    with pytest.raises(UserError, match=r"folder of this version: it has no run\.json with a spec"):
         find_model(Wanted(Path(runs[0].path)))
 
 
@@ -290,10 +290,10 @@ REFUSED = [
     (
         (),
         {"algo": "a2c", "env_id": CART},
-        r"trained on observations of shape \(8,\), and the environment .* gives shape \(4,\)",
+        r"trained on observations of size \(8,\), not Box\(.*: give its --env and",
     ),
     (SAID, {}, "name their file with --vec-normalize"),
-    ((*SAID, "vec_normalize.pkl"), {"algo": "dqn"}, "cannot be loaded as a dqn agent"),
+    ((*SAID, "vec_normalize.pkl"), {"algo": "dqn"}, "it is no dqn zip: try --algo ppo or a2c$"),
 ]
 
 
