@@ -7,7 +7,6 @@ import hmac
 import inspect
 import pickle
 import random
-import traceback
 from copy import deepcopy
 from functools import cache, cached_property
 from typing import Any, ClassVar, Self
@@ -71,10 +70,8 @@ class PlainAgent(OnlineAlgorithm):
         except TypeError as error:
             if not str(error).startswith("cannot "):  # an error of the user's own code
                 raise
-            seen = [frame.f_locals for frame, _ in traceback.walk_tb(error.__traceback__)]
-            at = [x["pair"][0] if "pair" in x else x["key"] for x in seen if {*x} & {"pair", "key"}]
-            place = ".".join(map(str, [self.plain.__name__, *at]))
-            raise ValueError(f"{place}: {error}: leave it out, as by __getstate__") from error
+            way_out = "leave it out, by __getstate__ or state_dict"
+            raise ValueError(f"{self.plain.__name__} {error}: {way_out}") from error
 
     def _made(self) -> Any:
         seen, done, outside = self.observation_space, self.action_space, gym.Env[Any, Any]()
