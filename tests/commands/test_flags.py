@@ -138,6 +138,8 @@ def test_an_engine_is_a_setting_where_there_is_a_choice(tmp_path):
 
 # What may be typed beside --resume: nothing that the run has already, not even as it has it.
 ALLOWED = {"--gym-packages": "math", "--log-folder": "logs", "--verbose": "0", "--progress": None}
+ALLOWED |= {"--track": None, "--wandb-project-name": "a", "--wandb-entity": "b"}
+ALLOWED |= {"--wandb-group": "c", "--wandb-tags": "d"}
 OTHERS = {"--engine": "auto", "--hyperparams": "gamma:0.9", "--eval-freq": "5", "--trial-id": "5"}
 OTHERS |= {"--eval-episodes": "5", "--env-kwargs": "a:1", "--eval-env-kwargs": "a:1"}
 
