@@ -24,16 +24,17 @@ import numpy as np
 from gymnasium import spaces
 
 from rl_yardstick.mdp.transition_model import TransitionModel
-from rl_yardstick.pipeline.environment_findings import LEVELS, Finding, Findings
+from rl_yardstick.pipeline import environment_trial
 from rl_yardstick.pipeline.environment_trial import (
     SEED,
     STATISTICS,
+    Finding,
+    Findings,
     Step,
     first_difference,
     layers_of,
     look_at_calls,
     look_at_seed,
-    play,
     same,
 )
 from rl_yardstick.pipeline.errors import one_line
@@ -43,8 +44,7 @@ N_PLAYED, N_LONG, N_SEEDED, N_WATCHED = 1000, 6000, 120, 10  # steps
 N_STARTS, START_STEPS = 8, 20  # plays that are compared with each other, and their steps
 MOST_STATES = 100_000  # of a model that is read
 SLOW, HUGE = 0.003, 1000.0  # seconds of a step; a reward
-CHANGED_REWARD = ("NormalizeReward", "ClipReward", "TransformReward")
-USELESS = {"old-api", "no-space", "crash"}  # nothing else can be checked
+LEVELS = ("breaks", "bites", "note")
 # Where one of these was found, two plays may differ for that reason.
 UNREPEATABLE = {"seed", "global-generator", "shared-state", "state-survives-reset"}
 
@@ -61,27 +61,28 @@ class Examination:
     def play(self, env: Any, n_steps: int, **options: Any) -> list[Step]:
         """Play for at most two seconds."""
         until = min(self.until, time.monotonic() + 2)
-        return play(env, n_steps, until, self.found, **options)
+        return environment_trial.play(env, n_steps, until, self.found, **options)
 
 
 def examine(make: Callable[..., gym.Env[Any, Any]], seconds: float = SECONDS) -> list[Finding]:
     """What is wrong with an environment, the worst first.
 
-    Args:
-        make: makes a new copy; is also called with ``render_mode``.
-        seconds: after which no further step begins.
+    ``make`` makes a new copy, and is also called with ``render_mode``. No step begins after that
+    many seconds.
     """
     one, printed = Examination(make, time.monotonic() + seconds), io.StringIO()
     with warnings.catch_warnings(), contextlib.redirect_stdout(printed):
         warnings.simplefilter("ignore")
-        for check in CHECKS:
+        for check, failure in CHECKS.items():
             try:
                 check(one)
+            except gym.error.DependencyNotInstalled:
+                continue
             except (Exception, SystemExit) as error:  # noqa: BLE001  # the environment may raise any
                 last = traceback.extract_tb(error.__traceback__)[-1]
                 where = f"{last.filename.rpartition('/')[2]}:{last.lineno}"
-                one.found.add("crash", f"{type(error).__name__}: {one_line(error)}", where)
-            if USELESS & one.found.keys():
+                one.found.add(failure, f"{type(error).__name__}: {one_line(error)}", where)
+            if one.found.keys() & {"old-api", "no-space"}:
                 break
     if time.monotonic() > one.until:
         one.found.add("slow", f"{seconds:g} s were too short for all checks")
@@ -90,28 +91,26 @@ def examine(make: Callable[..., gym.Env[Any, Any]], seconds: float = SECONDS) ->
     return sorted(one.found.values(), key=lambda finding: LEVELS.index(finding.level))
 
 
-# --- spaces and calls -----------------------------------------------------------------------------
+# --- spaces, calls, and the published model -------------------------------------------------------
 
 
 def check_spaces_and_calls(one: Examination) -> None:
     """Spaces that trainings cannot use, or that `reset` makes anew; calls of an old Gym."""
-    env = one.make()
-    known = {}
+    base, known = one.make().unwrapped, {}
     for name in ("observation_space", "action_space"):
-        known[name] = space = getattr(env.unwrapped, name, None)
+        known[name] = space = getattr(base, name, None)
         if not isinstance(space, spaces.Space):
             one.found.add("no-space", f"{name} is no gymnasium space", name)
             return
         for path, leaf in _leaves(space):
             if np.any(getattr(leaf, "start", 0)):
                 one.found.add("space-start", f"{leaf} does not count from 0", f"{name}{path}")
-    actions = env.action_space
-    if isinstance(actions, spaces.Box) and not actions.is_bounded():
+    if isinstance(base.action_space, spaces.Box) and not base.action_space.is_bounded():
         one.found.add("action-bounds", "actions have no bounds", "action_space")
     before = copy.deepcopy(known)
-    look_at_calls(one.found, env.unwrapped)
+    look_at_calls(one.found, base)
     for name, old in before.items():
-        new = getattr(env.unwrapped, name)
+        new = getattr(base, name)
         if new != old:
             one.found.add("space-changed", f"reset or step turns {old} into {new}", name)
         elif new is not known[name]:
@@ -133,24 +132,20 @@ def check_model(one: Examination) -> None:
     table, starts = getattr(base, "P", None), getattr(base, "initial_state_distrib", None)
     if hasattr(base, "transition_model"):
         model = base.transition_model()
-    elif not isinstance(table, Mapping) or starts is None or len(table) > MOST_STATES:
-        return
+    elif isinstance(table, Mapping) and starts is not None and len(table) <= MOST_STATES:
+        model = TransitionModel.from_gymnasium(table, starts)
     else:
-        try:
-            model = TransitionModel.from_gymnasium(table, starts)
-        except (ValueError, TypeError, LookupError) as error:
-            one.found.add("model", f"P is no model: {one_line(error)}", "P")
-            return
+        return
     possible = model.prob > 0
     met = possible & model.reachable[:, None, None]
     # The rows of states in which episodes end mean nothing.
     is_last = np.isin(np.arange(model.n_states), model.next_state[possible & model.terminated])
     asked = possible & (model.reachable | ~is_last)[:, None, None]
-    best, top = model.reward[met].max(), model.reward[asked].max()
-    has_end = model.terminated[met].any() or not model.terminated[asked].any()
-    one.has_goal = bool(model.reward[met].any() and model.terminated[met].any())
-    if max(best, 0) < top - 1e-9 or not has_end:
-        told = f"no episode can pay {top:g}" if has_end else "no episode can end"
+    top, has_end = model.reward[asked].max(), bool(model.terminated[met].any())
+    one.has_goal = has_end and bool(model.reward[met].any())
+    can_pay = max(model.reward[met].max(), 0) >= top - 1e-9
+    if not can_pay or (model.terminated[asked].any() and not has_end):
+        told = "no episode can end" if can_pay else f"no episode can pay {top:g}"
         count = f"P: {int(model.reachable.sum()):,} of {model.n_states:,} states can be reached"
         one.found.add("goal-unreachable", told, count)
 
@@ -160,39 +155,36 @@ def check_model(one: Examination) -> None:
 
 def check_play(one: Examination) -> None:
     """Single steps, and what lengths, rewards and observations of random episodes show."""
-    env = one.make()
+    env, limit = one.make(), gym.wrappers.TimeLimit
     steps = one.play(env, N_PLAYED)
     if not any(step.reward for step in steps) or not any(map(_ends, steps)):
         steps = one.play(env, N_LONG)
     taken = [step for step in steps if not step.is_start]
-    if (seconds := float(np.median([step.seconds for step in taken]))) > SLOW:
+    seconds, told = float(np.median([step.seconds for step in taken])), f"in {len(taken):,} steps"
+    if seconds > SLOW:
         one.found.add("slow", f"a step takes {1000 * seconds:.1f} ms")
-    rewards = [abs(step.reward) for step in taken if np.isfinite(step.reward)]
-    if max(rewards, default=0.0) > HUGE:
-        one.found.add("reward-huge", f"rewards reach {max(rewards):,.0f}; 1 is best for networks")
-    many, told = len(taken) >= N_PLAYED, f"in {len(taken):,} random steps"
-    if many and not any(rewards) and not one.has_goal:
-        one.found.add("reward-never", f"no reward {told}")
-    if many and not any(map(_ends, steps)) and not one.has_goal and not _limits(env):
-        one.found.add("no-end", f"no episode ended {told}, and there is no time limit")
-    has_many = many and getattr(env.observation_space, "n", 2) > 1
-    if has_many and all(same(steps[0].obs, step.obs) for step in steps):
-        one.found.add("observation-constant", f"the observation never changes {told}")
-    lengths = _lengths(steps)
-    if len(lengths) >= 5 and 10 <= min(lengths) == max(lengths) and not _shows_the_end(steps):
-        same_actions = _lengths(one.play(env, 5 * lengths[0], same_action=True))
-        if {*same_actions} == {*lengths} and all(step.terminated for step in steps if _ends(step)):
-            told = f"all episodes are terminated after exactly {lengths[0]} steps"
-            one.found.add("limit-as-terminated", told, f"step {lengths[0]}")
-    _look_after_an_end(one, one.make().unwrapped)
+    largest = max((abs(step.reward) for step in taken if np.isfinite(step.reward)), default=0.0)
+    if largest > HUGE:
+        one.found.add("reward-huge", f"rewards reach {largest:,.0f}; 1 is best for networks")
+    if len(taken) >= N_PLAYED:
+        if not largest and not one.has_goal:
+            one.found.add("reward-never", f"no reward {told} at random")
+        has_limit = any(isinstance(layer, limit) for layer in layers_of(env))
+        if not any(map(_ends, steps)) and not one.has_goal and not has_limit:
+            one.found.add("no-end", f"no episode ended {told}, and there is no time limit")
+        has_choice = getattr(env.observation_space, "n", 2) > 1
+        if has_choice and all(same(steps[0].obs, step.obs) for step in steps):
+            one.found.add("observation-constant", f"the observation never changes {told}")
+    lengths = {*_lengths(steps)}
+    if len(lengths) == 1 and min(lengths) >= 10 and not _shows_the_end(steps):
+        others = one.play(env, 5 * min(lengths), same_action=True)
+        if {*_lengths(others)} == lengths and not any(step.truncated for step in steps):
+            told = f"all episodes are terminated after exactly {min(lengths)} steps"
+            one.found.add("limit-as-terminated", told)
 
 
 def _ends(step: Step) -> bool:
     return step.terminated or step.truncated
-
-
-def _limits(env: Any) -> bool:
-    return any(isinstance(layer, gym.wrappers.TimeLimit) for layer in layers_of(env))
 
 
 def _lengths(steps: list[Step]) -> list[int]:
@@ -212,8 +204,9 @@ def _shows_the_end(steps: list[Step]) -> bool:
     return bool(apart.any())
 
 
-def _look_after_an_end(one: Examination, base: Any) -> None:
-    is_over = False
+def check_after_an_end(one: Examination) -> None:
+    """A step after the end of an episode."""
+    base, is_over = one.make().unwrapped, False
     with contextlib.suppress(Exception):  # refusing such a step is right
         base.reset(seed=SEED)
         for _ in range(N_PLAYED):
@@ -237,14 +230,14 @@ def check_seeds(one: Examination) -> None:
         one.found.add("global-generator", told)
     changed = [name for name, value in _shared_values(env).items() if shared.get(name) != value]
     second = one.play(other, len(first))
-    if (at := first_difference(first, second)) and changed:
-        told = "what one copy does changes the next copy"
-        one.found.add("shared-state", told, f"{changed[0]}, {at}")
+    at = first_difference(first, second)
+    if at and changed:
+        one.found.add("shared-state", "one copy changes the next", f"{changed[0]}, {at}")
         return
     look_at_seed(one.found, first, second)
     seeded = [one.play(other, START_STEPS, seed=seed) for seed in range(N_STARTS)]
     n_kinds = sum(all(first_difference(a, b) for b in seeded[:n]) for n, a in enumerate(seeded))
-    if not at and (where := first_difference(first, one.play(env, len(first)))):
+    if not at and (at := first_difference(first, one.play(env, len(first)))):
         kinds = (np.random.Generator, np.random.RandomState, random.Random)
         values = vars(env.unwrapped).items()
         own = [name for name, v in values if isinstance(v, kinds) and name != "_np_random"]
@@ -252,30 +245,12 @@ def check_seeds(one: Examination) -> None:
         if own:
             one.found.add("seed", f"{told}: a generator ignores it", f"self.{own[0]}")
         elif not any("Normalize" in type(layer).__name__ for layer in layers_of(env)):
-            one.found.add("state-survives-reset", told, where)
+            one.found.add("state-survives-reset", told, at)
     elif n_kinds > 2:
         unseeded = [one.play(env, START_STEPS, seed=None) for _ in range(N_STARTS)]
         if not any(first_difference(unseeded[0], start) for start in unseeded):
             told = "reset() without a seed gives the same episode each time, and seeds others"
             one.found.add("reset-repeats", told, "reset")
-
-
-def check_copies(one: Examination) -> None:
-    """A copy plays the same while another copy plays beside it."""
-    beside = one.make()
-    beside.reset(seed=SEED + 1)
-
-    def step_beside() -> None:
-        _, _, terminated, truncated, _ = beside.step(beside.action_space.sample())
-        if terminated or truncated:
-            beside.reset()
-
-    alone = one.play(one.make(), N_SEEDED)
-    together = one.play(one.make(), N_SEEDED, before=step_beside)
-    at = first_difference(alone, together)
-    if at and not UNREPEATABLE & one.found.keys():
-        told = "a copy plays another episode while another copy plays"
-        one.found.add("shared-state", told, at)
 
 
 def _shared_values(env: Any) -> dict[str, bytes]:
@@ -297,6 +272,23 @@ def _global_generators() -> list[Any]:
     return [random.getstate(), *np.random.get_state()]  # noqa: NPY002
 
 
+def check_copies(one: Examination) -> None:
+    """A copy plays the same while another copy plays beside it."""
+    beside = one.make()
+    beside.reset(seed=SEED + 1)
+
+    def step_beside() -> None:
+        _, _, terminated, truncated, _ = beside.step(beside.action_space.sample())
+        if terminated or truncated:
+            beside.reset()
+
+    together = one.play(one.make(), N_SEEDED, before=step_beside)
+    at = first_difference(one.play(one.make(), N_SEEDED), together)
+    if at and not UNREPEATABLE & one.found.keys():
+        told = "a copy plays another episode while another copy plays"
+        one.found.add("shared-state", told, at)
+
+
 # --- around the environment -----------------------------------------------------------------------
 
 
@@ -306,47 +298,46 @@ def check_rendering(one: Examination) -> None:
     mode = next((mode for mode in ("rgb_array", "ansi") if mode in modes), None)
     if mode is None:
         return
-    try:
-        watched = one.make(render_mode=mode)
-        watched.reset(seed=SEED)
-        frame = np.asarray(watched.render())
-    except gym.error.DependencyNotInstalled:
-        return
-    except Exception as error:  # noqa: BLE001  # the environment may raise any
-        one.found.add("render", f"{mode}: {type(error).__name__}: {one_line(error)}", "render")
-        return
+    watched = one.make(render_mode=mode)
+    watched.reset(seed=SEED)
+    frame = np.asarray(watched.render())
     if watched.render_mode != mode:
         one.found.add("render", f"render_mode is {watched.render_mode!r}, not {mode!r}", "__init__")
     elif mode == "rgb_array" and (frame.dtype != np.uint8 or frame.ndim != 3):
         told = f"rgb_array gives {frame.dtype} of the shape {frame.shape}"
         one.found.add("render", told, "render")
-    plain = one.play(one.make(), N_WATCHED)
     seen = one.play(watched, N_WATCHED, before=watched.render)
-    at = first_difference(plain, seen)
+    at = first_difference(one.play(one.make(), N_WATCHED), seen)
     if at and not UNREPEATABLE & one.found.keys():
         told = "an episode that is watched is another than one that is not"
         one.found.add("render-changes", told, at)
 
 
-def check_wrappers_and_copying(one: Examination) -> None:
-    """Wrappers that count the wrong episodes or returns; what `copy.deepcopy` cannot copy."""
+def check_wrappers(one: Examination) -> None:
+    """A time limit around the wrapper that counts episodes."""
+    names = [type(layer).__name__ for layer in layers_of(one.make())]  # the outermost first
+    for place, name in enumerate(names):
+        if name in STATISTICS and "TimeLimit" in names[:place]:
+            told = f"TimeLimit lies around {name}, which never counts what is cut off"
+            one.found.add("wrapper-order", told, " > ".join(names))
+
+
+def check_copying(one: Examination) -> None:
+    """Whether `copy.deepcopy` works, which look-ahead uses."""
     env = one.make()
-    names = [type(layer).__name__ for layer in layers_of(env)]  # the outermost first
-    for place in [place for place, name in enumerate(names) if name in STATISTICS]:
-        chain, counts = " > ".join(names), names[place]
-        if "TimeLimit" in names[:place]:
-            told = f"TimeLimit lies around {counts}, which never counts what is cut off"
-            one.found.add("wrapper-order", told, chain)
-        if changed := [name for name in names[place:] if name in CHANGED_REWARD]:
-            one.found.add("statistics-order", f"{counts} counts after {changed[0]}", chain)
     env.reset(seed=SEED)
-    try:
-        copy.deepcopy(env.unwrapped)
-    except Exception as error:  # noqa: BLE001  # the environment may raise any
-        one.found.add("not-copyable", f"deepcopy: {type(error).__name__}: {one_line(error)}")
+    copy.deepcopy(env.unwrapped)
 
 
-CHECKS = (
-    *(check_spaces_and_calls, check_model, check_play, check_seeds),
-    *(check_copies, check_rendering, check_wrappers_and_copying),
-)
+# The checks in their order, and what it is if one of them raises.
+CHECKS = {
+    check_spaces_and_calls: "crash",
+    check_model: "model",
+    check_play: "crash",
+    check_after_an_end: "crash",
+    check_seeds: "crash",
+    check_copies: "crash",
+    check_rendering: "render",
+    check_wrappers: "crash",
+    check_copying: "not-copyable",
+}

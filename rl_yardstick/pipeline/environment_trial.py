@@ -12,15 +12,17 @@ import random
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
-from functools import partial
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import yaml
 from gymnasium import spaces
 
 from rl_yardstick.envs.wrappers import action_masks
-from rl_yardstick.pipeline.environment_findings import Findings
 from rl_yardstick.pipeline.environments import Env, creator_of, make_single_env
 from rl_yardstick.pipeline.errors import UserError, shown
 from rl_yardstick.pipeline.spec import Component, TrainSpec
@@ -34,6 +36,35 @@ UNUSABLE = ("old-api", "observation-not-in-space")  # nothing can learn there
 STATISTICS = ("RecordEpisodeStatistics", "Monitor")  # wrappers that write info["episode"]
 RESERVED = ("terminal_observation", "TimeLimit.truncated", "final_obs", "final_info")
 ACTION, START = "observation, reward, terminated, truncated, info", "observation, info"
+
+
+@cache
+def kinds() -> Mapping[str, tuple[str, str]]:
+    """The level of each kind of finding, and how to mend it, by name."""
+    path = Path(__file__).with_name("environment_findings.yml")
+    found: dict[str, tuple[str, str]] = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return found
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong, and where it was first seen."""
+
+    level: str
+    name: str  #: one of `kinds`
+    what: str
+    where: str  #: a step, an attribute, a file and line; may be empty
+    mend: str
+
+
+class Findings(dict[str, Finding]):
+    """The first finding of each name."""
+
+    def add(self, name: str, what: str, where: str = "") -> None:
+        """Add a finding, unless that name was found before; long texts are shortened."""
+        level, mend = kinds()[name]
+        text = " ".join(what.split())
+        self.setdefault(name, Finding(level, name, text[:160], where, mend))
 
 
 class Step(NamedTuple):
@@ -85,8 +116,8 @@ def play(
             found.add("observation-in-place", "a step changes the last observation", where)
         obs, _, terminated, truncated, _ = outcome
         _look_at_observation(found, space, obs, where)
-        paid = _look_at_outcome(found, layers, outcome, where)
         ends = bool(terminated), bool(truncated)
+        paid = _look_at_outcome(found, layers, outcome, where)
         steps.append(Step(_kept(obs), paid, *ends, seconds=seconds))
         if any(ends):
             obs, action = env.reset()[0], None
@@ -147,13 +178,13 @@ def look_at_calls(found: Findings, env: Any) -> None:
         told = "Gymnasium calls reset(seed=..., options=...), which the environment does not take"
         found.add("old-api", told, "reset")
         return
-    for call, wanted in (("reset", START), ("step", ACTION)):
-        if call == "step":
-            given = env.step(copy.deepcopy(env.action_space).sample())
-        if not isinstance(given, tuple) or len(given) != wanted.count(",") + 1:
-            told = f"{len(given)} values" if isinstance(given, tuple) else "one value"
-            found.add("old-api", f"{call} returns {told}, not {wanted}", call)
-            return
+    if not isinstance(given, tuple) or len(given) != 2:
+        found.add("old-api", f"reset returns one value, not {START}", "reset")
+        return
+    given = env.step(copy.deepcopy(env.action_space).sample())
+    if not isinstance(given, tuple) or len(given) != 5:
+        told = f"{len(given)} values" if isinstance(given, tuple) else "one value"
+        found.add("old-api", f"step returns {told}, not {ACTION}", "step")
 
 
 def look_at_seed(found: Findings, one: list[Step], other: list[Step]) -> None:
@@ -175,21 +206,20 @@ def _look_at_observation(found: Findings, space: Any, obs: Any, where: str) -> N
     is_finite = is_number and (is_array or not array.size) and bool(np.isfinite(array).all())
     if is_finite and space.contains(obs):
         return
-    if not isinstance(space, spaces.Box) or not is_number:
-        told = f"the observation {shown(obs)} is not in {space}"
-        found.add("observation-not-in-space", told, where)
-    elif array.shape != space.shape:
-        told = f"has the shape {array.shape}, and its space the shape {space.shape}"
-        found.add("observation-not-in-space", f"the observation {told}", where)
-    elif not np.isfinite(array).all():
-        found.add("observation-nan", "the observation holds nan or infinity", where)
-    elif not ((array >= space.low) & (array <= space.high)).all():
-        reach = f"from {array.min():g} to {array.max():g}"
-        found.add("observation-out-of-bounds", f"observations leave the bounds: {reach}", where)
-    else:
-        kind = array.dtype if isinstance(obs, np.ndarray) else f"a {type(obs).__name__}"
-        told = f"observations are {kind}, and their space is {space.dtype}"
-        found.add("observation-dtype", told, where)
+    name, told = "observation-not-in-space", f"the observation {shown(obs)} is not in {space}"
+    if isinstance(space, spaces.Box) and array.shape != space.shape:
+        told = f"the observation has the shape {array.shape}, and its space the shape {space.shape}"
+    elif isinstance(space, spaces.Box) and is_number:
+        if not np.isfinite(array).all():
+            name, told = "observation-nan", "the observation holds nan or infinity"
+        elif not ((array >= space.low) & (array <= space.high)).all():
+            told = f"observations leave the bounds: from {array.min():g} to {array.max():g}"
+            name = "observation-out-of-bounds"
+        else:
+            kind = array.dtype if is_array else f"a {type(obs).__name__}"
+            name, told = "observation-dtype", f"observations are {kind}, and their space is "
+            told += f"{space.dtype}"
+    found.add(name, told, where)
 
 
 def _look_at_outcome(found: Findings, layers: list[Any], outcome: Any, where: str) -> float:
@@ -201,8 +231,7 @@ def _look_at_outcome(found: Findings, layers: list[Any], outcome: Any, where: st
     elif not np.isfinite(reward):
         found.add("reward-nan", f"the reward is {reward}", where)
     if not all(isinstance(value, bool | np.bool_) for value in (terminated, truncated)):
-        told = f"terminated, truncated are {terminated!r}, {truncated!r}"
-        found.add("end-type", told, where)
+        found.add("end-type", f"terminated, truncated are {terminated!r}, {truncated!r}", where)
     for layer in [each for each in layers if isinstance(each, gym.wrappers.TimeLimit)]:
         taken: Any = layer._elapsed_steps
         if not truncated and taken >= layer._max_episode_steps:
@@ -215,9 +244,8 @@ def _look_at_outcome(found: Findings, layers: list[Any], outcome: Any, where: st
     if "episode" in info and not (has_statistics and (terminated or truncated)):
         told = "the environment's own info['episode'] is left out of trainings"
         found.add("info-episode", told, where)
-    for key in RESERVED:
-        is_right = key == "TimeLimit.truncated" and info.get(key) == (truncated and not terminated)
-        if key in info and not is_right:
+    for key in info.keys() & {*RESERVED}:
+        if key != "TimeLimit.truncated" or info[key] != (truncated and not terminated):
             found.add("info-key", f"the environment's own info[{key!r}] is overwritten", where)
     return float(reward)
 

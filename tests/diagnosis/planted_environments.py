@@ -7,7 +7,7 @@ import time
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.wrappers import ClipReward, RecordEpisodeStatistics, TimeLimit
+from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
 LIMIT = 40
 
@@ -202,7 +202,6 @@ FAULTS = [
     ("prints", "it prints", {"told": lambda s: print("at", s.place) or {}}),
     ("crash", "it raises", {"told": lambda s: {} if s.time < 5 else {}["key"]}),
     ("wrapper-order", "a limit around it", lambda env: TimeLimit(RecordEpisodeStatistics(env), 9)),
-    ("statistics-order", "others' rewards", lambda e: RecordEpisodeStatistics(ClipReward(e, 0, 1))),
     ("truncation-lost", "truncated swallowed", lambda env: Swallowing(TimeLimit(env, 4))),
 ]
 CLOCK = with_own(observation_space=lambda: spaces.Box(0, 1, (1,)))

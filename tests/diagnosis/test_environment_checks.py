@@ -10,7 +10,7 @@ from rl_yardstick.commands import check_env
 from rl_yardstick.diagnosis import environment_checks
 from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.envs import ENVIRONMENTS
-from rl_yardstick.pipeline.environment_findings import KINDS
+from rl_yardstick.pipeline.environment_trial import kinds
 from tests.diagnosis.planted_environments import FAULTS, RIGHT, maker
 
 OF_GYMNASIUM = ("FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v4", "CliffWalking-v1", "Blackjack-v1")
@@ -34,7 +34,7 @@ def test_a_planted_fault_is_found_under_its_name_and_nothing_else_breaks(name, f
 
 
 def test_every_kind_of_finding_is_planted():
-    assert {name for name, *_ in FAULTS} == set(KINDS)
+    assert {name for name, *_ in FAULTS} == set(kinds())
 
 
 @pytest.mark.parametrize("name", RIGHT)
