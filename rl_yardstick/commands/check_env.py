@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from typing import Any
 
@@ -38,6 +39,7 @@ def main() -> int:
     from rl_yardstick.pipeline.files import write_json
     from rl_yardstick.pipeline.settings import parse_assignments
 
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # frames need no display
     console, begin = table_console(), time.monotonic()
     kwargs = {**parse_assignments(args.env_kwargs, "--env-kwargs"), "disable_env_checker": True}
     make_env(args.env, kwargs).close()  # mistakes in the command end here

@@ -214,7 +214,7 @@ def check_after_an_end(one: Examination) -> None:
             if time.monotonic() > one.until or (was_over and is_over):
                 return
             if was_over:
-                one.found.add("step-after-end", "a step after an end goes on")
+                one.found.add("step-after-end", "a step after an end does not end")
 
 
 # --- seeds and copies -----------------------------------------------------------------------------

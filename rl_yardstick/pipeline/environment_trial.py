@@ -213,7 +213,7 @@ def _look_at_observation(found: Findings, space: Any, obs: Any, where: str) -> N
         if not np.isfinite(array).all():
             name, told = "observation-nan", "the observation holds nan or infinity"
         elif not ((array >= space.low) & (array <= space.high)).all():
-            told = f"observations leave the bounds: from {array.min():g} to {array.max():g}"
+            told = f"observations leave their space: values from {array.min():g} to {array.max():g}"
             name = "observation-out-of-bounds"
         else:
             kind = array.dtype if is_array else f"a {type(obs).__name__}"
