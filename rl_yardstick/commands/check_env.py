@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from typing import Any
 
@@ -42,6 +43,7 @@ def main() -> int:
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # frames need no display
     console, begin = table_console(), time.monotonic()
     kwargs = {**parse_assignments(args.env_kwargs, "--env-kwargs"), "disable_env_checker": True}
+    console.file = sys.stdout  # the checks redirect it
     make_env(args.env, kwargs).close()  # mistakes in the command end here
     with console.status("checking"):
         found = examine(lambda **extra: make_env(args.env, {**kwargs, **extra}))

@@ -1,49 +1,38 @@
-"""A right environment, and copies of it with one fault each."""
+"""A right environment, and copies of it with one fault each, made by changes of its source."""
 
-import random
-import threading
-import time
+import inspect
+import random  # noqa: F401  # by faults
+import threading  # noqa: F401
+import time  # noqa: F401
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
-LIMIT = 40
-
 
 class Ferry(gym.Env):
-    """Crosses a windy river of 6 by 6 places; a landing on the other shore pays 1, and ends."""
+    """Crosses a windy river of 6 by 6 places, and is paid if it lands high on the other shore."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012  # as Gymnasium's
-    limit = LIMIT
 
     def __init__(self, render_mode=None):
         self.render_mode = render_mode
         self.observation_space = spaces.Box(0, 5, (2,), np.float32)
         self.action_space = spaces.Discrete(3)
-        self.time = 0
-        self.prepare()
 
     def reset(self, *, seed=None, options=None):
-        super().reset(seed=self.seed_of(seed))
+        super().reset(seed=seed)
         self.place, self.time = np.array([0, self.drawn(6)]), 0
         return self.seen(), {}
 
     def step(self, action):
         self.time += 1
-        self.act(action)
-        return self.seen(), self.pay(), self.over(), self.cut(), self.told()
-
-    def act(self, action):
-        self.place[1] = np.clip(self.place[1] + int(action) - 1 + self.drawn(3) - 1, 0, 5)
+        self.place[1] = np.clip(self.place[1] + action - 1 + self.drawn(3) - 1, 0, 5)
         self.place[0] = min(self.place[0] + (self.drawn(4) > 0), 5)
-
-    def prepare(self):
-        pass
-
-    def seed_of(self, seed):
-        return seed
+        done, info = bool(self.place[0] == 5), {"time": self.time}
+        reward = float(done and self.place[1] > 2)
+        return self.seen(), reward, done, False, info
 
     def drawn(self, n):
         return int(self.np_random.integers(n))
@@ -51,169 +40,145 @@ class Ferry(gym.Env):
     def seen(self):
         return self.place.astype(np.float32)
 
-    def pay(self):
-        return float(self.place[0] == 5 and self.place[1] > 2)
-
-    def over(self):
-        return bool(self.place[0] == 5)
-
-    def cut(self):
-        return False
-
-    def told(self):
-        return {}
-
     def render(self):
         return np.full((8, 8, 3), self.place[0], np.uint8)
 
 
-def with_own(**makers):
-    """A last step of the constructor, which sets attributes, each made by its function."""
-    return {"prepare": lambda s: vars(s).update({name: make() for name, make in makers.items()})}
+class Swallowing(gym.Wrapper):
+    def step(self, action):
+        obs, reward, terminated, _, info = super().step(action)
+        return obs, reward, terminated, False, info
 
 
 def corridor(n_open):
     """A model of five places in a row, of which only the first ones can be reached."""
     ahead = [min(s + 1, n_open - 1 if s < n_open else 4) for s in range(5)]
-    rows = {
+    return {
         s: {a: [(1.0, t, float(t == 4), t == 4)] for a in range(3)} for s, t in enumerate(ahead)
     }
-    return with_own(P=lambda: rows, initial_state_distrib=lambda: np.eye(5)[0])
 
 
-def filled(array, value):
-    array[:] = value
-    return array
+LOG = []
+# Texts in the source of the ferry.
+SPACE, ACTIONS, SEEDED = "spaces.Box(0, 5, (2,), np.float32)", "spaces.Discrete(3)", "(seed=seed)"
+DRAW, SEEN = "self.np_random.integers(n)", "self.place.astype(np.float32)"
+MOVE = "self.place[1] + action - 1"
+DONE, PAY, INFO = (
+    "bool(self.place[0] == 5)",
+    "float(done and self.place[1] > 2)",
+    '"time": self.time',
+)
+TIME, FRAME = "self.time += 1", "np.full((8, 8, 3), self.place[0], np.uint8)"
+STARTS = "self.initial_state_distrib = np.eye(5)[0]"
+OWN = f"{ACTIONS}; self.own = np.random.default_rng"
+KEY = "spaces.Dict(at=spaces.Discrete(6))"
+FROM_TWO = "spaces.Dict(at=spaces.Discrete(6, start=2))"
+CLEARING = "(seed=seed); LOG.clear()"
+TREASURE = (TIME, f"{TIME}; self.found |= self.time > 4", ACTIONS, f"{ACTIONS}; self.found = False")
+ARRAY = (ACTIONS, f"{ACTIONS}; self.array = np.zeros(2, np.float32)")
+CLIP = "self.place[1] + np.clip(action, -0.5, 0.5, out=action)[0]"
+# What has to be found; the fault; texts in the source, each with another one in its place.
+CHANGES = [
+    ("seed", "numpy's generator", DRAW, "np.random.randint(n)"),
+    ("seed", "Python's generator", DRAW, "random.randrange(n)"),
+    ("seed", "the time of day", DRAW, "time.perf_counter_ns() // 64 % n"),
+    ("seed", "a generator of its own", DRAW, "self.own.integers(n)", ACTIONS, f"{OWN}()"),
+    ("seed", "a seed of its own", DRAW, "self.own.integers(n)", ACTIONS, f"{OWN}(3)"),
+    ("global-generator", "numpy is seeded", SEEDED, "(seed=seed); np.random.seed(seed)"),
+    ("reset-repeats", "the same seed again", SEEDED, "(seed=seed or 5)"),
+    ("shared-state", "a global list", PAY, "LOG.append(1) or float(len(LOG))"),
+    (
+        "shared-state",
+        "a dict in the class",
+        PAY,
+        "self.metadata.update({len(self.metadata): 1}) or len(self.metadata)",
+    ),
+    ("shared-state", "a cleared list", PAY, "LOG.append(1) or len(LOG)", SEEDED, CLEARING),
+    ("state-survives-reset", "a treasure stays found", *TREASURE, PAY, "float(self.found)"),
+    ("observation-in-place", "the place", SEEN, "self.place", "np.float32", "np.int64"),
+    (
+        "observation-in-place",
+        "one array",
+        SEEN,
+        "np.copyto(self.array, self.place) or self.array",
+        *ARRAY,
+    ),
+    ("observation-out-of-bounds", "too far", SEEN, f"2 * {SEEN}"),
+    ("observation-not-in-space", "another shape", SEEN, "np.zeros(3 - (self.time < 4), 'f4')"),
+    ("observation-not-in-space", "too large", SEEN, "self.place[0]", SPACE, "spaces.Discrete(5)"),
+    ("observation-not-in-space", "no key", SEEN, "{'at': 0} if self.time < 3 else {}", SPACE, KEY),
+    ("observation-dtype", "double precision", SEEN, "self.place * 1.0"),
+    ("observation-dtype", "a list", SEEN, "[float(x) for x in self.place]"),
+    ("observation-nan", "nan", SEEN, "np.array([np.nan if self.time == 3 else 1, 1], 'f4')"),
+    ("observation-constant", "nothing to see", SEEN, "np.ones(2, np.float32)"),
+    ("reward-nan", "nan as reward", PAY, "np.nan if self.time == 3 else 0.0"),
+    ("reward-nan", "infinity as reward", PAY, "np.inf if self.time > 4 else 0.0"),
+    ("reward-type", "a reward in an array", PAY, "np.ones(1)"),
+    ("reward-type", "no reward", PAY, "None"),
+    ("reward-huge", "a million", PAY, "1e6 * done"),
+    ("reward-never", "never a reward", PAY, "0.0"),
+    ("info-episode", "info['episode']", INFO, "'episode': self.time"),
+    ("info-key", "the last observation", INFO, "'terminal_observation': self.seen()"),
+    ("info-key", "always a time limit", INFO, "'TimeLimit.truncated': True"),
+    ("info-type", "no info", f"{{{INFO}}}", "None"),
+    ("end-type", "an end that is a number", DONE, "int(self.place[0] == 5)"),
+    (
+        "space-start",
+        "actions from 1",
+        ACTIONS,
+        "spaces.Discrete(3, start=1)",
+        "action - 1",
+        "action",
+    ),
+    ("space-start", "a part from 2", SPACE, FROM_TWO, SEEN, "{'at': self.place[0] + 2}"),
+    (
+        "space-changed",
+        "a space that grows",
+        SEEDED,
+        f"{SEEDED}; self.observation_space = spaces.Box(0, 9, (2,))",
+    ),
+    ("space-remade", "a new space", SEEDED, f"{SEEDED}; self.action_space = {ACTIONS}"),
+    ("action-bounds", "no bounds", ACTIONS, "spaces.Box(-np.inf, np.inf, ())"),
+    ("action-changed", "clipped in place", ACTIONS, "spaces.Box(-1, 1, (1,))", MOVE, CLIP),
+    ("no-space", "no action space", ACTIONS, "3"),
+    ("old-api", "reset without a seed", "(self, *, seed=None, options=None)", "(self, seed=None)"),
+    ("old-api", "four things from step", "done, False, info", "done, info"),
+    ("limit-as-terminated", "a limit as an end", DONE, "self.time >= 20"),
+    ("step-after-end", "life after an end", DONE, "self.time % 7 == 6"),
+    ("goal-unreachable", "a wall", ACTIONS, f"{ACTIONS}; self.P = corridor(3); {STARTS}"),
+    ("model", "no model", ACTIONS, f"{ACTIONS}; self.P = {{0: {{0: [(0.5, 0, 0, 1)]}}}}; {STARTS}"),
+    ("render", "a frame of fractions", FRAME, "np.zeros((8, 8, 3))"),
+    ("render", "a forgotten mode", "self.render_mode = render_mode", "pass"),
+    ("render-changes", "drawing draws", FRAME, f"np.full_like({FRAME}, self.drawn(9))"),
+    ("not-copyable", "a lock", ACTIONS, f"{ACTIONS}; self.lock = threading.Lock()"),
+    ("slow", "a slow step", TIME, f"{TIME}; time.sleep(0.005)"),
+    ("prints", "it prints", TIME, f"{TIME}; print('at', self.place)"),
+    ("crash", "it raises", TIME, f"{TIME}; action = action if self.time < 5 else {{}}['key']"),
+]
+CLOCK = (SPACE, "spaces.Box(0, 1, (1,))", SEEN, "np.array([self.time / 20], np.float32)")
+RIGHT = {
+    "ferry": (),
+    "it shows the time": (*CLOCK, DONE, "self.time >= 20"),
+    "an open corridor": (ACTIONS, f"{ACTIONS}; self.P = corridor(5); {STARTS}"),
+    "a right key": (INFO, "'TimeLimit.truncated': False"),
+}
 
 
-class Old(Ferry):
-    def reset(self):
-        return super().reset()
+def maker(changes, wrap=lambda env: TimeLimit(env, 40)):
+    """A function that makes copies of the ferry with changes of its source, in a wrapper."""
+    source = inspect.getsource(Ferry)
+    for old, new in zip(changes[::2], changes[1::2], strict=True):
+        assert old in source
+        source = source.replace(old, new)
+    inside = dict(globals())
+    exec(source, inside)  # noqa: S102  # the source above
+    return lambda **kwargs: wrap(inside["Ferry"](**kwargs))
 
 
-class OldStep(Ferry):
-    def step(self, action):
-        obs, reward, terminated, truncated, info = super().step(action)
-        return obs, reward, terminated or truncated, info
-
-
-class Remade(Ferry):
-    size = 0
-
-    def reset(self, **kwargs):
-        self.observation_space = spaces.Box(0, 5 + self.size, (2,), np.float32)
-        return super().reset(**kwargs)
-
-
-class Growing(Remade):
-    size = 1
-
-
-class Treasure(Ferry):
-    found = False
-
-    def pay(self):
-        self.found |= self.time > 4
-        return float(self.found)
-
-
-class Swallowing(gym.Wrapper):
-    def step(self, action):
-        obs, reward, _, _, info = super().step(action)
-        return obs, reward, self.unwrapped.over(), False, info
-
-
-nan, rng, CLASSICAL, LOG, CLEARED = float("nan"), np.random.default_rng, np.random, [], []
-OWN_GENERATOR = {"drawn": lambda s, n: s.own.integers(n)}
-OWN_LOG = {"log": [], "pay": lambda s: s.log.append(1) or float(len(s.log))}
-CLEARS = {"seed_of": lambda s, seed: CLEARED.clear() or seed}
-CLEARS |= {"pay": lambda s: CLEARED.append(1) or float(len(CLEARED))}
-WHOLE = with_own(observation_space=lambda: spaces.Box(0, 5, (2,), np.int64))
-ONE_ARRAY = with_own(array=lambda: np.zeros(2, np.float32))
-FIVE = with_own(observation_space=lambda: spaces.Discrete(5))
-KEYS = with_own(observation_space=lambda: spaces.Dict(at=spaces.Discrete(6)))
-OTHER_SHAPE = {"seen": lambda s: np.zeros(3 if s.time == 4 else 2, np.float32)}
-HOLE = {"seen": lambda s: np.array([nan if s.time == 3 else 1, s.place[0]], "f4")}
-FROM_ONE = with_own(action_space=lambda: spaces.Discrete(3, start=1))
-FROM_ONE |= {"act": lambda s, action: Ferry.act(s, action - 1)}
-NESTED = with_own(observation_space=lambda: spaces.Dict(at=spaces.Discrete(6, start=2)))
-NESTED |= {"seen": lambda s: {"at": int(s.place[0]) + 2}}
-UNBOUNDED = with_own(action_space=lambda: spaces.Box(-np.inf, np.inf, (1,)))
-UNBOUNDED |= {"act": lambda s, action: Ferry.act(s, np.sign(action[0]) + 1)}
-CLIPPING = with_own(action_space=lambda: spaces.Box(-1, 1, (1,), np.float32))
-CLIPPING |= {"act": lambda s, a: Ferry.act(s, np.clip(a, -0.5, 0.5, out=a)[0] + 1)}
-HALF = with_own(P=lambda: {0: {0: [(0.5, 0, 0.0, True)]}}, initial_state_distrib=lambda: [1.0])
-DRAWS = {"render": lambda s: np.full((8, 8, 3), s.drawn(9), np.uint8)}
-OVER = {"TimeLimit.truncated": True}
-# What has to be found; the fault; the members of the class that have it, or class, or wrapper.
-FAULTS = [
-    ("seed", "numpy's generator", {"drawn": lambda s, n: CLASSICAL.randint(n)}),
-    ("seed", "Python's generator", {"drawn": lambda s, n: random.randrange(n)}),  # noqa: S311
-    ("seed", "a generator at every step", {"drawn": lambda s, n: rng().integers(n)}),
-    ("seed", "the time of day", {"drawn": lambda s, n: time.perf_counter_ns() // 64 % n}),
-    ("seed", "a generator of its own", OWN_GENERATOR | with_own(own=rng)),
-    ("seed", "a seed of its own", OWN_GENERATOR | with_own(own=lambda: rng(3))),
-    ("global-generator", "numpy is seeded", {"seed_of": lambda s, n: CLASSICAL.seed(n) or n}),
-    ("reset-repeats", "the same seed again", {"seed_of": lambda s, seed: seed or 5}),
-    ("shared-state", "a global list", {"pay": lambda s: LOG.append(1) or float(len(LOG))}),
-    ("shared-state", "a list in the class", OWN_LOG),
-    ("shared-state", "a list that reset clears", CLEARS),
-    ("state-survives-reset", "a treasure stays found", Treasure),
-    ("observation-in-place", "the place itself", WHOLE | {"seen": lambda s: s.place}),
-    ("observation-in-place", "one array", ONE_ARRAY | {"seen": lambda s: filled(s.array, s.place)}),
-    ("observation-out-of-bounds", "too far", {"seen": lambda s: s.place.astype("f4") * 2}),
-    ("observation-not-in-space", "another shape", OTHER_SHAPE),
-    ("observation-not-in-space", "too large", FIVE | {"seen": lambda s: int(s.place[0])}),
-    ("observation-not-in-space", "no key", KEYS | {"seen": lambda s: {"at": 0} if s.time else {}}),
-    ("observation-dtype", "double precision", {"seen": lambda s: s.place * 1.0}),
-    ("observation-dtype", "a list", {"seen": lambda s: [float(x) for x in s.place]}),
-    ("observation-nan", "nan in an observation", HOLE),
-    ("observation-constant", "nothing to see", {"seen": lambda s: np.ones(2, np.float32)}),
-    ("reward-nan", "nan as reward", {"pay": lambda s: nan if s.time == 3 else 0.0}),
-    ("reward-nan", "infinity as reward", {"pay": lambda s: np.inf if s.time > 4 else 0.0}),
-    ("reward-type", "a reward in an array", {"pay": lambda s: np.ones(1)}),
-    ("reward-type", "no reward", {"pay": lambda s: None}),
-    ("reward-huge", "a million", {"pay": lambda s: 1e6 * s.over()}),
-    ("reward-never", "never a reward", {"pay": lambda s: 0.0}),
-    ("info-episode", "info['episode']", {"told": lambda s: {"episode": s.time}}),
-    ("info-key", "the last observation", {"told": lambda s: {"terminal_observation": s.place}}),
-    ("info-key", "always a time limit", {"told": lambda s: OVER}),
-    ("info-type", "no info", {"told": lambda s: None}),
-    ("end-type", "an end that is a number", {"over": lambda s: int(s.place[0] == 5)}),
-    ("space-start", "actions from 1", FROM_ONE),
-    ("space-start", "a part that counts from 2", NESTED),
-    ("space-changed", "a space that grows", Growing),
-    ("space-remade", "a space made in reset", Remade),
-    ("action-bounds", "actions without bounds", UNBOUNDED),
-    ("action-changed", "an action clipped in place", CLIPPING),
-    ("no-space", "no action space", with_own(action_space=lambda: 3)),
-    ("old-api", "reset without a seed", Old),
-    ("old-api", "four things from step", OldStep),
-    ("no-end", "no end", {"over": lambda s: False, "limit": None}),
-    ("limit-as-terminated", "a limit as an end", {"over": lambda s: s.time >= 20}),
-    ("step-after-end", "life after an end", {"over": lambda s: s.time % 7 == 6}),
-    ("goal-unreachable", "a goal behind a wall", corridor(3)),
-    ("model", "half a probability", HALF),
-    ("render", "a frame of fractions", {"render": lambda s: np.zeros((8, 8, 3))}),
-    ("render", "a forgotten mode", with_own(render_mode=lambda: None)),
-    ("render-changes", "drawing draws", DRAWS),
-    ("not-copyable", "a lock", with_own(lock=threading.Lock)),
-    ("slow", "a slow step", {"told": lambda s: time.sleep(0.005) or {}}),
-    ("prints", "it prints", {"told": lambda s: print("at", s.place) or {}}),
-    ("crash", "it raises", {"told": lambda s: {} if s.time < 5 else {}["key"]}),
-    ("wrapper-order", "a limit around it", lambda env: TimeLimit(RecordEpisodeStatistics(env), 9)),
+WRAPPED = [
+    ("wrapper-order", "statistics inside", lambda env: TimeLimit(RecordEpisodeStatistics(env), 9)),
     ("truncation-lost", "truncated swallowed", lambda env: Swallowing(TimeLimit(env, 4))),
 ]
-CLOCK = with_own(observation_space=lambda: spaces.Box(0, 1, (1,)))
-CLOCK |= {"seen": lambda s: np.array([s.time / 20], "f4"), "over": lambda s: s.time >= 20}
-RIGHT_KEY = {"told": lambda s: {"TimeLimit.truncated": False}}
-RIGHT = {"ferry": {}, "shows the time": CLOCK, "open corridor": corridor(5), "key": RIGHT_KEY}
-
-
-def maker(change):
-    """A function that makes copies of a class, or of one with members, or in a wrapper."""
-    kind = type("Faulty", (Ferry,), change) if isinstance(change, dict) else change
-    if not isinstance(kind, type):
-        return lambda **kwargs: change(Ferry(**kwargs))
-    is_limited = kind.limit is not None
-    return lambda **kwargs: TimeLimit(kind(**kwargs), LIMIT) if is_limited else kind(**kwargs)
+PLANTED = {fault: (name, maker(changes)) for name, fault, *changes in CHANGES}
+PLANTED |= {fault: (name, maker((), wrap)) for name, fault, wrap in WRAPPED}
+PLANTED["no end"] = ("no-end", maker((DONE, "False"), lambda env: env))

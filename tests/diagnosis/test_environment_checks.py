@@ -11,7 +11,7 @@ from rl_yardstick.diagnosis import environment_checks
 from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.envs import ENVIRONMENTS
 from rl_yardstick.pipeline.environment_trial import kinds
-from tests.diagnosis.planted_environments import FAULTS, RIGHT, maker
+from tests.diagnosis.planted_environments import PLANTED, RIGHT, maker
 
 OF_GYMNASIUM = ("FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v4", "CliffWalking-v1", "Blackjack-v1")
 OF_GYMNASIUM += ("CartPole-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Pendulum-v1")
@@ -26,15 +26,16 @@ def short_plays(monkeypatch):
     monkeypatch.setattr(environment_checks, "N_LONG", 2000)
 
 
-@pytest.mark.parametrize(("name", "fault", "change"), FAULTS, ids=[row[1] for row in FAULTS])
-def test_a_planted_fault_is_found_under_its_name_and_nothing_else_breaks(name, fault, change):
-    found = {one.name: one for one in examine(maker(change))}
+@pytest.mark.parametrize("fault", PLANTED)
+def test_a_planted_fault_is_found_under_its_name_and_nothing_else_breaks(fault):
+    name, make = PLANTED[fault]
+    found = {one.name: one for one in examine(make)}
     assert name in found, found
     assert [one for one in found.values() if one.level == "breaks" and one.name != name] == []
 
 
 def test_every_kind_of_finding_is_planted():
-    assert {name for name, *_ in FAULTS} == set(kinds())
+    assert {name for name, _ in PLANTED.values()} == set(kinds())
 
 
 @pytest.mark.parametrize("name", RIGHT)
@@ -51,42 +52,27 @@ def test_no_false_alarm(env_id, tmp_path):
     assert [one for one in found if one.level != "note"] == []
 
 
-@pytest.fixture
-def check(monkeypatch, capsys, tmp_path):
-    """Type ``check-env`` on the fault of that name: the exit code, the output and the JSON."""
-    faults = {fault: change for _, fault, change in FAULTS}
-
-    def run(fault, *words):
-        entry = maker(faults.get(fault, {}))
-        monkeypatch.setitem(
-            gym.registry, "Ferry-v0", gym.envs.registration.EnvSpec("Ferry-v0", entry)
-        )
-        path = tmp_path / "found.json"
-        monkeypatch.setattr(
-            "sys.argv", ["yardstick check-env", "Ferry-v0", "--json", str(path), *words]
-        )
-        code = check_env.main()
-        return code, capsys.readouterr().out, json.loads(path.read_text())
-
-    return run
-
-
-@pytest.mark.parametrize("env", ["terminal", "pipe"])
-def test_the_command(check, monkeypatch, env):
-    code, out, told = check("none of them")
-    assert (code, told["findings"]) == (0, [])
-    assert out.startswith("Ferry-v0: nothing found in ")
-    code, out, told = check("double precision")  # bites
-    assert (code, told["findings"][0]["name"]) == (0, "observation-dtype")
-    if env == "terminal":
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_the_command(monkeypatch, capsys, tmp_path, is_terminal):
+    monkeypatch.setattr("sys.argv", ["yardstick check-env", "Ferry-v0", "--json", "found.json"])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    if is_terminal:
         monkeypatch.setenv("FORCE_COLOR", "1")
-        monkeypatch.setenv("COLUMNS", "80")
-    code, out, told = check("four things from step")
-    assert code == 1
-    assert {*told["findings"][0]} == {"level", "name", "what", "where", "mend"}
-    if env == "terminal":
-        assert "how to mend" in out
-        assert max(map(len, re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", out).splitlines())) == 80
-    else:
-        assert max(map(len, out.splitlines())) <= 100
-        assert " ".join(out.split()).startswith(" ".join(LINE.split()))
+    wanted = {None: (0, None), "double precision": (0, "bites"), "no info": (1, "breaks")}
+    for fault, (code, level) in wanted.items():
+        spec = gym.envs.registration.EnvSpec("Ferry-v0", PLANTED[fault][1] if fault else maker(()))
+        monkeypatch.setitem(gym.registry, "Ferry-v0", spec)
+        assert check_env.main() == code
+        lines = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", capsys.readouterr().out).splitlines()
+        findings = json.loads((tmp_path / "found.json").read_text())["findings"]
+        if level is None:
+            assert findings == []
+            assert lines[-1].startswith("Ferry-v0: nothing found in ")
+            continue
+        assert findings[0]["level"] == level
+        assert {*findings[0]} == {"level", "name", "what", "where", "mend"}
+        assert any(line.startswith("┃ level") for line in lines) == is_terminal
+        assert any(line.startswith(f"{level} ") for line in lines) != is_terminal
+        assert max(map(len, lines)) <= 80 + 20 * (not is_terminal), lines
+        assert lines[-1].startswith("Ferry-v0: 1 finding in ")
