@@ -68,7 +68,7 @@ def main() -> None:
     }
     rows = ["| checker | found | missed | false alarms | seconds each |", "|---|---|---|---|---|"]
     for name, check in {**checkers, "`yardstick check-env`": found_by_us}.items():
-        usual, begin, n_found = check(maker(())), time.monotonic(), 0
+        usual, begin, n_found = check(maker()), time.monotonic(), 0
         for kind, make in PLANTED.values():
             told = check(make) - usual
             n_found += bool({kind, f"note: {kind}"} & told) if check is found_by_us else bool(told)

@@ -48,13 +48,8 @@ FOUND_IN = {
     for command in COMMAND.findall(document.read_text().replace("--env\nWare", "--env Ware"))
 }
 MODULES = {"train.py": train, "enjoy.py": enjoy, "compare.py": compare, "tune.py": tune}
-MODULES |= {
-    "explain": explain,
-    "rate": rate,
-    "shaping": shaping,
-    "audit": audit,
-    "check-env": check_env,
-}
+MODULES |= {"explain": explain, "rate": rate, "shaping": shaping, "audit": audit}
+MODULES["check-env"] = check_env
 COMMANDS = [pytest.param(each, id=f"{name}: {each}") for each, name in FOUND_IN.items()]
 
 

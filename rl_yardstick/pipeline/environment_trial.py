@@ -7,19 +7,19 @@ Before anything learns on a user's environment, two copies are tried for some st
 from __future__ import annotations
 
 import copy
+import json
 import math
 import random
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from gymnasium import spaces
 
 from rl_yardstick.envs.wrappers import action_masks
@@ -35,15 +35,9 @@ WITHOUT_EPISODE = "rl_yardstick.envs.wrappers.WithoutEpisodeInfo"
 UNUSABLE = ("old-api", "observation-not-in-space")  # nothing can learn there
 STATISTICS = ("RecordEpisodeStatistics", "Monitor")  # wrappers that write info["episode"]
 RESERVED = ("terminal_observation", "TimeLimit.truncated", "final_obs", "final_info")
+# By the name of each kind of finding: its level, and how to mend it.
+KINDS = json.loads(Path(__file__).with_name("environment_findings.json").read_text("utf-8"))
 ACTION, START = "observation, reward, terminated, truncated, info", "observation, info"
-
-
-@cache
-def kinds() -> Mapping[str, tuple[str, str]]:
-    """The level of each kind of finding, and how to mend it, by name."""
-    path = Path(__file__).with_name("environment_findings.yml")
-    found: dict[str, tuple[str, str]] = yaml.safe_load(path.read_text(encoding="utf-8"))
-    return found
 
 
 @dataclass(frozen=True)
@@ -51,7 +45,7 @@ class Finding:
     """One thing that is wrong, and where it was first seen."""
 
     level: str
-    name: str  #: one of `kinds`
+    name: str  #: one of `KINDS`
     what: str
     where: str  #: a step, an attribute, a file and line; may be empty
     mend: str
@@ -62,7 +56,7 @@ class Findings(dict[str, Finding]):
 
     def add(self, name: str, what: str, where: str = "") -> None:
         """Add a finding, unless that name was found before; long texts are shortened."""
-        level, mend = kinds()[name]
+        level, mend = KINDS[name]
         text = " ".join(what.split())
         self.setdefault(name, Finding(level, name, text[:160], where, mend))
 
@@ -217,8 +211,8 @@ def _look_at_observation(found: Findings, space: Any, obs: Any, where: str) -> N
             name = "observation-out-of-bounds"
         else:
             kind = array.dtype if is_array else f"a {type(obs).__name__}"
-            name, told = "observation-dtype", f"observations are {kind}, and their space is "
-            told += f"{space.dtype}"
+            told = f"observations are {kind}, and their space is {space.dtype}"
+            name = "observation-dtype"
     found.add(name, told, where)
 
 
@@ -227,7 +221,7 @@ def _look_at_outcome(found: Findings, layers: list[Any], outcome: Any, where: st
     _, reward, terminated, truncated, info = outcome
     if np.ndim(reward) or isinstance(reward, str | complex | None):
         found.add("reward-type", f"the reward is {shown(reward)}", where)
-        reward = 0.0
+        reward = np.asarray(reward).flat[0] if np.ndim(reward) else 0.0
     elif not np.isfinite(reward):
         found.add("reward-nan", f"the reward is {reward}", where)
     if not all(isinstance(value, bool | np.bool_) for value in (terminated, truncated)):

@@ -144,7 +144,7 @@ CHANGES = [
     ("old-api", "reset without a seed", "(self, *, seed=None, options=None)", "(self, seed=None)"),
     ("old-api", "four things from step", "done, False, info", "done, info"),
     ("limit-as-terminated", "a limit as an end", DONE, "self.time >= 20"),
-    ("step-after-end", "life after an end", DONE, "self.time % 7 == 6"),
+    ("step-after-end", "life after an end", DONE, "self.time % 7 == 6", PAY, "1.0"),
     ("goal-unreachable", "a wall", ACTIONS, f"{ACTIONS}; self.P = corridor(3); {STARTS}"),
     ("model", "no model", ACTIONS, f"{ACTIONS}; self.P = {{0: {{0: [(0.5, 0, 0, 1)]}}}}; {STARTS}"),
     ("render", "a frame of fractions", FRAME, "np.zeros((8, 8, 3))"),
@@ -164,7 +164,7 @@ RIGHT = {
 }
 
 
-def maker(changes, wrap=lambda env: TimeLimit(env, 40)):
+def maker(changes=(), wrap=lambda env: TimeLimit(env, 40)):
     """A function that makes copies of the ferry with changes of its source, in a wrapper."""
     source = inspect.getsource(Ferry)
     for old, new in zip(changes[::2], changes[1::2], strict=True):

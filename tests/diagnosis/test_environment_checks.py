@@ -10,7 +10,7 @@ from rl_yardstick.commands import check_env
 from rl_yardstick.diagnosis import environment_checks
 from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.envs import ENVIRONMENTS
-from rl_yardstick.pipeline.environment_trial import kinds
+from rl_yardstick.pipeline.environment_trial import KINDS
 from tests.diagnosis.planted_environments import PLANTED, RIGHT, maker
 
 OF_GYMNASIUM = ("FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v4", "CliffWalking-v1", "Blackjack-v1")
@@ -22,8 +22,9 @@ LINE = (
 
 @pytest.fixture(autouse=True)
 def short_plays(monkeypatch):
-    monkeypatch.setattr(environment_checks, "N_PLAYED", 300)
-    monkeypatch.setattr(environment_checks, "N_LONG", 2000)
+    shorter = {"N_PLAYED": 200, "N_LONG": 1000, "N_SEEDED": 60, "START_STEPS": 10}
+    for name, n_steps in shorter.items():
+        monkeypatch.setattr(environment_checks, name, n_steps)
 
 
 @pytest.mark.parametrize("fault", PLANTED)
@@ -35,7 +36,7 @@ def test_a_planted_fault_is_found_under_its_name_and_nothing_else_breaks(fault):
 
 
 def test_every_kind_of_finding_is_planted():
-    assert {name for name, _ in PLANTED.values()} == set(kinds())
+    assert {name for name, _ in PLANTED.values()} == set(KINDS)
 
 
 @pytest.mark.parametrize("name", RIGHT)
