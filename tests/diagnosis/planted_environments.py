@@ -156,12 +156,6 @@ CHANGES = [
     ("crash", "it raises", TIME, f"{TIME}; action = action if self.time < 5 else {{}}['key']"),
 ]
 CLOCK = (SPACE, "spaces.Box(0, 1, (1,))", SEEN, "np.array([self.time / 20], np.float32)")
-RIGHT = {
-    "ferry": (),
-    "it shows the time": (*CLOCK, DONE, "self.time >= 20"),
-    "an open corridor": (ACTIONS, f"{ACTIONS}; self.P = corridor(5); {STARTS}"),
-    "a right key": (INFO, "'TimeLimit.truncated': False"),
-}
 
 
 def maker(changes=(), wrap=lambda env: TimeLimit(env, 40)):
@@ -182,3 +176,9 @@ WRAPPED = [
 PLANTED = {fault: (name, maker(changes)) for name, fault, *changes in CHANGES}
 PLANTED |= {fault: (name, maker((), wrap)) for name, fault, wrap in WRAPPED}
 PLANTED["no end"] = ("no-end", maker((DONE, "False"), lambda env: env))
+RIGHT = {
+    "ferry": maker(),
+    "it shows the time": maker((*CLOCK, DONE, "self.time >= 20")),
+    "an open corridor": maker((ACTIONS, f"{ACTIONS}; self.P = corridor(5); {STARTS}")),
+    "a right key": maker((INFO, "'TimeLimit.truncated': False")),
+}

@@ -11,7 +11,7 @@ from rl_yardstick.diagnosis import environment_checks
 from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.envs import ENVIRONMENTS
 from rl_yardstick.pipeline.environment_trial import KINDS
-from tests.diagnosis.planted_environments import PLANTED, RIGHT, maker
+from tests.diagnosis.planted_environments import PLANTED, RIGHT
 
 OF_GYMNASIUM = ("FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v4", "CliffWalking-v1", "Blackjack-v1")
 OF_GYMNASIUM += ("CartPole-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Pendulum-v1")
@@ -41,7 +41,7 @@ def test_every_kind_of_finding_is_planted():
 
 @pytest.mark.parametrize("name", RIGHT)
 def test_nothing_is_found_in_a_right_environment(name):
-    assert examine(maker(RIGHT[name])) == []
+    assert examine(RIGHT[name]) == []
 
 
 @pytest.mark.parametrize("env_id", [*ENVIRONMENTS, *OF_GYMNASIUM, "Acrobot-v1"])
@@ -62,7 +62,9 @@ def test_the_command(monkeypatch, capsys, tmp_path, is_terminal):
         monkeypatch.setenv("FORCE_COLOR", "1")
     wanted = {None: (0, None), "double precision": (0, "bites"), "no info": (1, "breaks")}
     for fault, (code, level) in wanted.items():
-        spec = gym.envs.registration.EnvSpec("Ferry-v0", PLANTED[fault][1] if fault else maker(()))
+        spec = gym.envs.registration.EnvSpec(
+            "Ferry-v0", PLANTED[fault][1] if fault else RIGHT["ferry"]
+        )
         monkeypatch.setitem(gym.registry, "Ferry-v0", spec)
         assert check_env.main() == code
         lines = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", capsys.readouterr().out).splitlines()
