@@ -10,7 +10,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rl_yardstick.commands import audit, compare, enjoy, explain, rate, shaping, train, tune
+from rl_yardstick.commands import (
+    audit,
+    check_env,
+    compare,
+    enjoy,
+    explain,
+    rate,
+    shaping,
+    train,
+    tune,
+)
 from rl_yardstick.commands.compare import study_spec
 from rl_yardstick.commands.train import spec_from_flags
 from rl_yardstick.commands.tune import tuning_spec
@@ -26,8 +36,9 @@ from recommended_commands import reached, trainings, with_outcomes  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 COMPARE = (ROOT / "docs" / "compare.md").read_text()
+MODULE_COMMANDS = "explain|rate|shaping|audit|check-env"
 COMMAND = re.compile(
-    r"python ((?:(?:train|enjoy|compare|tune)\.py|-m rl_yardstick (?:explain|rate|shaping|audit))"
+    rf"python ((?:(?:train|enjoy|compare|tune)\.py|-m rl_yardstick (?:{MODULE_COMMANDS}))"
     r" [^`\n)#]*)"
 )
 # Each with the first document that it stands in.
@@ -38,6 +49,7 @@ FOUND_IN = {
 }
 MODULES = {"train.py": train, "enjoy.py": enjoy, "compare.py": compare, "tune.py": tune}
 MODULES |= {"explain": explain, "rate": rate, "shaping": shaping, "audit": audit}
+MODULES["check-env"] = check_env
 COMMANDS = [pytest.param(each, id=f"{name}: {each}") for each, name in FOUND_IN.items()]
 
 

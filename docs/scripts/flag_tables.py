@@ -10,7 +10,7 @@ from importlib import import_module
 def flags_block(command: str) -> str:
     """A row for each argument of a command, with what its help says."""
     parser: argparse.ArgumentParser = import_module(
-        f"rl_yardstick.commands.{command}"
+        f"rl_yardstick.commands.{command.replace('-', '_')}"
     ).build_parser()
     lines = ["| argument | what it does |", "|---|---|"]
     for action in parser._actions:

@@ -18,6 +18,7 @@ COMMANDS = {
     "tune": "search for an agent's settings, and test them on other seeds",
     "explain": "show where an agent loses return against the optimum",
     "rate": "rate Q-tables, models and policies against the exact optimum",
+    "check-env": "check an environment for mistakes, without training",
     "shaping": "show whether other rewards in training change the optimum, and their cost",
     "audit": "test an implementation for known bugs",
     "inspect": "list the content of a model file without running any of it",
@@ -34,7 +35,7 @@ def main() -> NoReturn:
 
 
 def run_command(name: str) -> NoReturn:
-    """Run ``rl_yardstick.commands.<name>.main`` and leave the process.
+    """Run ``main`` of a command's module and leave the process.
 
     Exit codes: 0; 1 if a study has runs that failed; 2 after a mistake, told in one line; 128 + the
     number of a signal.
@@ -60,9 +61,9 @@ def _exit_code(name: str) -> int:
 
     from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, visible
 
-    example = ""
+    example, module = "", name.replace("-", "_")
     try:
-        return int(import_module(f"rl_yardstick.commands.{name}").main() or 0)
+        return int(import_module(f"rl_yardstick.commands.{module}").main() or 0)
     except UserError as error:
         message, example = str(error), error.example
     except BrokenPipeError:  # such as ``| head``

@@ -32,7 +32,7 @@ def main() -> int:
     if word == "--version":
         sys.stdout.write(f"{version('rl-yardstick')}\n")
     elif word in ("-h", "--help"):
-        lines = "".join(f"  {NAME} {each:<9}{summary}\n" for each, summary in COMMANDS.items())
+        lines = "".join(f"  {NAME} {each:<10}{summary}\n" for each, summary in COMMANDS.items())
         sys.stdout.write(f"usage: {NAME} [-h] [--version] COMMAND ...\n\ncommands:\n{lines}")
     elif not word:
         raise UserError(f"which command? {', '.join(COMMANDS)}")
