@@ -199,8 +199,9 @@ def _in_parts(
 ) -> NDArray[Any]:
     """Call ``asked`` on batches of observations that a network can take."""
     n_states = len(observations)
-    n_inputs = max(spaces.flatdim(agent.observation_space), 1)
-    n_rows = max(MOST_AT_ONCE // n_inputs, 1) if is_network(agent) else n_states
+    n_rows = n_states
+    if is_network(agent):
+        n_rows = max(MOST_AT_ONCE // max(spaces.flatdim(agent.observation_space), 1), 1)
     told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
     if n_states <= n_rows:
         return asked(observations, **told)
