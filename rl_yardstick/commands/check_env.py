@@ -13,7 +13,7 @@ from rl_yardstick.commands.cli import OneLineParser, flag, shared
 EPILOG = """\
 examples:
   python -m rl_yardstick check-env CartPole-v1
-  python -m rl_yardstick check-env my/Corridor-v0 --gym-packages my_corridor
+  python -m rl_yardstick check-env Warehouse-v0 --env-kwargs slip:0.1 --json findings.json
 
 Exit code: 0 if nothing breaks trainings, 1 if something does, 2 after a mistake in the command.
 """

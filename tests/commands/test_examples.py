@@ -24,7 +24,8 @@ compare.py --algos dqn --env Taxi-v4 -n 20 --seeds 1 --name my_study --no-report
 
 
 def test_every_example_works(type_in_own_folder, own_folder, in_this_process):
-    modules = [importlib.import_module(f"rl_yardstick.commands.{c}") for c in COMMANDS]
+    names = [command.replace("-", "_") for command in COMMANDS]
+    modules = [importlib.import_module(f"rl_yardstick.commands.{name}") for name in names]
     texts = [getattr(module, "EPILOG", "") for module in modules]
     examples = [line for text in texts for line in re.findall(r"^  (python .*)$", text, re.M)]
     assert len(examples) >= 20
