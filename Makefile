@@ -92,7 +92,7 @@ $(STAMP): pyproject.toml $(PINS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
 	  { echo "Yardstick needs Python 3.11 or newer; $(PYTHON) is not. Name one: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "Setting up .venv (once, some minutes: PyTorch is large)"
-	@cat $(PINS) | cmp -s - .venv/pins || \
+	@cat $(PINS) 2>/dev/null | cmp -s - .venv/pins || \
 	  { $(PYTHON) -m venv --clear .venv && cat $(PINS) >.venv/pins; }
 	@$(BIN)/python -m pip install --quiet --no-deps -r requirements.txt
 	@$(BIN)/python -m pip install --quiet --no-build-isolation -c constraints.txt -e '.[dev]'
