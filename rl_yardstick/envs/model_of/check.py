@@ -1,12 +1,8 @@
 """Whether an environment does what a model of it says: 20,000 steps of it, outcome by outcome.
 
-One outcome that the model calls impossible refutes it. Frequencies refute it where they are too
-unlikely, with a chance of a false alarm of about one in a million:
-
-- of each outcome of each state and action: if its probability is p, the probability of a frequency
-  f in n steps, or one farther from p, is at most exp(-n KL(f, p)) on each side, where KL is the
-  relative entropy (Hoeffding, 1963);
-- of the first outcome of all states and actions together, of the second, and so on.
+One outcome that the model calls impossible refutes it. So does a frequency that lies six standard
+deviations from its expectation: of one outcome of one state and action, or of the first outcomes of
+all states and actions together, the second ones, and so on.
 """
 
 from __future__ import annotations
@@ -22,8 +18,8 @@ import numpy as np
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 STEPS = 20_000
-FALSE_ALARM = 1e-6
-MOST_DEVIATIONS = 5.0  # of a normal distribution, nearly as rare
+MOST_DEVIATIONS = 6.0
+FEWEST = 9.0  # a variance below which counts are far from normally distributed
 
 
 class Check:
@@ -101,20 +97,19 @@ class Check:
 
     def _unlikely(self) -> str | None:
         """The frequency that the model makes too unlikely."""
-        limit = math.log(2 * sum(map(len, self.rows.values())) / FALSE_ALARM)
-        ranks: dict[int, list[float]] = {}
+        together: dict[int, list[float]] = {}
         for (state, action), row in self.rows.items():
             n = sum(count for _, count in row.values())
             for rank, ((target, _), (p, count)) in enumerate(row.items()):
-                deviation = ranks.setdefault(rank, [0.0, 0.0])
-                deviation[0] += count - n * p
-                deviation[1] += n * p * (1 - p)
-                if n and n * _relative_entropy(count / n, p) > limit:
-                    to = "the end" if target < 0 else target
+                off, variance = count - n * p, n * p * (1 - p)
+                if abs(off) > MOST_DEVIATIONS * math.sqrt(max(variance, FEWEST)):
                     came = f"has a probability of {p:.3g}, and came {count:.0f} of {n:.0f} times"
+                    to = "the end" if target < 0 else target
                     return f"state {state}, action {action}: the step to {to} {came}"
-        for off, variance in ranks.values():
-            if variance > 1 and abs(off) > MOST_DEVIATIONS * math.sqrt(variance):
+                total = together.setdefault(rank, [0.0, 0.0])
+                total[:] = total[0] + off, total[1] + variance
+        for off, variance in together.values():
+            if abs(off) > MOST_DEVIATIONS * math.sqrt(max(variance, FEWEST)):
                 deviations = f"{abs(off) / math.sqrt(variance):.1f} standard deviations"
                 return f"outcomes are {deviations} from their probabilities"
         return None
@@ -124,10 +119,3 @@ def _rounded(key: tuple[int, Any]) -> tuple[int, float | None]:
     """An outcome with its reward to nine digits."""
     target, reward = key
     return target, None if reward is None else float(f"{float(reward):.9g}")
-
-
-def _relative_entropy(f: float, p: float) -> float:
-    """Of a coin that shows heads with probability f, against one with p."""
-    heads = f * math.log(f / p) if f > 0 else 0.0
-    tails = (1 - f) * math.log((1 - f) / max(1 - p, 1e-300)) if f < 1 else 0.0
-    return heads + tails

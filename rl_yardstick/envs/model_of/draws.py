@@ -17,10 +17,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from rl_yardstick.envs.model_of.symbols import NORMAL, UNIFORM, Count, Drawn, Stop, table, where
+from rl_yardstick.envs.model_of.symbols import NORMAL, TAIL, UNIFORM, Drawn, Stop, where
 
 NEVER = 1 << 60  # a time that no episode reaches
-MOST_BRANCHES = 20_000
+MOST = 20_000  # branches of one draw
 LEAST_CHANCE = 1e-13  # branches of a lower probability are cut off
 
 
@@ -42,7 +42,7 @@ class Script:
     def begin(self, choices: list[int], root: int, loops: dict[Any, bool]) -> None:
         """Start a run. Loops are looked for after ``root`` branches; the known ones are given."""
         self.choices, self.root, self.loops = choices, root, loops
-        self.trace: list[tuple[int, int | Sequence[float]]] = []
+        self.trace: list[tuple[int, list[float]]] = []
         self.chance = 1.0
         self.visits: dict[Any, int] = {}
         # Continuous numbers that were turned into floats, at this quantile of what is known.
@@ -50,19 +50,18 @@ class Script:
         self.level = 0.5
 
     def branch(self, chances: int | Sequence[float]) -> int:
-        """The number of the branch to take, of so many equal ones or of ones with these chances."""
-        n = chances if isinstance(chances, int) else len(chances)
-        if n > MOST_BRANCHES:
-            raise Stop(f"{where()} draws one of {n:,} values")
-        if n == 1:
+        """The number of the branch to take, of so many equal ones or of ones with these weights."""
+        weights = [1.0] * min(chances, MOST + 1) if isinstance(chances, int) else chances
+        if len(weights) > MOST:
+            raise Stop(f"{where()} draws one of more than {MOST:,} values")
+        if len(weights) == 1:
             return 0
-        depth = len(self.trace)
-        if depth < len(self.choices):
-            choice = self.choices[depth]
-        else:
-            choice = 0 if isinstance(chances, int) else next(i for i in range(n) if chances[i] > 0)
-        self.trace.append((choice, chances))
-        self.chance *= 1 / n if isinstance(chances, int) else chances[choice]
+        depth, total = len(self.trace), math.fsum(weights)
+        shares = [float(weight) / total for weight in weights]
+        taken = depth < len(self.choices)
+        choice = self.choices[depth] if taken else next(i for i, p in enumerate(shares) if p > 0)
+        self.trace.append((choice, shares))
+        self.chance *= shares[choice]
         if self.chance < LEAST_CHANCE and depth >= self.root:
             raise Again(-1)
         return choice
@@ -90,18 +89,30 @@ def take_step(env: gym.Env[Any, Any], action: Any) -> tuple[Any, ...]:
     return env.reset() if action is None else env.step(action)
 
 
-# Scale, shift and size of continuous numbers, from the arguments of the method.
-CONTINUOUS: dict[str, Any] = {
-    "random": (UNIFORM, lambda size=None, dtype=None: (1.0, 0.0, size)),
-    "rand": (UNIFORM, lambda *shape: (1.0, 0.0, shape or None)),
-    "uniform": (UNIFORM, lambda low=0.0, high=1.0, size=None: (np.subtract(high, low), low, size)),
-    "normal": (NORMAL, lambda loc=0.0, scale=1.0, size=None: (scale, loc, size)),
-    "standard_normal": (NORMAL, lambda size=None: (1.0, 0.0, size)),
-    "randn": (NORMAL, lambda *shape: (1.0, 0.0, shape or None)),
+# The law, its parameters (scale and shift of a continuous one) and the size, from the arguments.
+LAWS: dict[str, Callable[..., tuple[Any, ...]]] = {
+    "random": lambda size=None, dtype=None: (UNIFORM, 1.0, 0.0, size),
+    "random_sample": lambda size=None: (UNIFORM, 1.0, 0.0, size),
+    "rand": lambda *shape: (UNIFORM, 1.0, 0.0, shape or None),
+    "uniform": lambda low=0.0, high=1.0, size=None: (UNIFORM, np.subtract(high, low), low, size),
+    "normal": lambda loc=0.0, scale=1.0, size=None: (NORMAL, scale, loc, size),
+    "gauss": lambda mu=0.0, sigma=1.0: (NORMAL, sigma, mu, None),
+    "standard_normal": lambda size=None: (NORMAL, 1.0, 0.0, size),
+    "randn": lambda *shape: (NORMAL, 1.0, 0.0, shape or None),
+    "binomial": lambda n, p, size=None: ("binom", n, p, size),
+    "poisson": lambda lam=1.0, size=None: ("poisson", lam, size),
+    "geometric": lambda p, size=None: ("geom", p, size),
 }
-CONTINUOUS |= dict.fromkeys(("random_sample", "ranf"), CONTINUOUS["random"])
-CONTINUOUS |= dict.fromkeys(("gauss", "normalvariate"), CONTINUOUS["normal"])
-COUNTED = {"binomial": ("binom", 2), "poisson": ("poisson", 1), "geometric": ("geom", 1)}
+
+
+@functools.cache
+def table(name: str, *parameters: float) -> tuple[int, list[float]]:
+    """The lowest value of one of SciPy's distributions, and the chances of it and the next ones."""
+    from scipy import stats
+
+    law = getattr(stats, name)(*parameters)
+    low, high = int(law.support()[0]), int(law.isf(TAIL))
+    return low, law.pmf(np.arange(low, high + 1)).tolist()
 
 
 class NumpyDraws:
@@ -110,38 +121,28 @@ class NumpyDraws:
     def __init__(self, script: Script) -> None:
         self._script = script
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> NumpyDraws:
-        return self
-
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
         return functools.partial(self._distribution, name)
 
     def _distribution(self, name: str, *given: Any, **named: Any) -> Any:
-        """A draw of the distribution of this name."""
-        if name in CONTINUOUS:
-            law, parameters = CONTINUOUS[name]
-            scale, shift, size = parameters(*given, **named)
-
-            def draw(scale: float, shift: float) -> Any:
-                return (
-                    Drawn(self._script, [law, 0.0, 1.0, where()], scale, shift) if scale else shift
-                )
-
-            return self._each(draw, size, scale, shift)
+        """A draw from the law of this name."""
         if name == "seed":
             return None
-        if name not in COUNTED:
+        if name not in LAWS:
             raise Stop(f"{where()} draws by `{name}`, which cannot be enumerated")
-        kind, n = COUNTED[name]
-        size = given[n] if len(given) > n else named.pop("size", None)
+        law, *parameters, size = LAWS[name](*given, **named)
 
-        def count(*parameters: float) -> Count:
-            low, under = table(kind, *parameters)
-            return Count(self._script, [low, low + len(under) - 2, (low, under)])
+        def draw(*parameters: float) -> Any:
+            if isinstance(law, str):
+                low, weights = table(law, *parameters)
+                return low + self._script.branch(weights)
+            scale, shift = parameters
+            known = [law, 0.0, 1.0, where()]
+            return Drawn(self._script, known, scale, shift) if scale else shift
 
-        return self._each(count, size, *given[:n], *named.values(), dtype=np.int64)
+        return self._each(draw, size, *parameters, dtype=int if isinstance(law, str) else object)
 
     def _each(self, draw: Callable[..., Any], size: Any, *given: Any, dtype: Any = object) -> Any:
         """One draw, or an array of draws, with parameters that may be arrays."""
@@ -150,8 +151,6 @@ class NumpyDraws:
         flat = [np.broadcast_to(x, shape).ravel().tolist() for x in given]
         drawn = np.empty(math.prod(shape), object)
         drawn[:] = [draw(*parameters) for parameters in zip(*flat, strict=True)]
-        if shape == () and isinstance(drawn[0], Drawn | Count):
-            return drawn[0]
         return drawn.reshape(shape).astype(dtype)[()]
 
     def integers(
@@ -168,32 +167,28 @@ class NumpyDraws:
 
     randint = integers
 
-    def _pick(self, n: int, weights: Sequence[float] | None) -> int:
-        if weights is None:
-            return self._script.branch(n)
-        total = math.fsum(weights)
-        return self._script.branch([float(w) / total for w in weights])
-
     def _in_order(self, n: int, of: int, weights: list[float] | None = None) -> list[int]:
         """``n`` different numbers below ``of``, in the order in which they are drawn."""
         self._script.visit()
-        if math.perm(of, n) > MOST_BRANCHES:
+        if math.perm(of, n) > MOST:
             verb = f"shuffles {n}" if n == of else f"draws {n} of {of}"
             raise Stop(f"{where()} {verb} things: too many orders")
         left, picked = list(range(of)), []
         for _ in range(n):
-            i = self._pick(len(left), weights)
+            i = self._script.branch(weights or len(left))
             picked.append(left.pop(i))
-            if weights is not None:
-                weights.pop(i)
+            if weights:
+                del weights[i]
         return picked
 
     def choice(self, a: Any, size: Any = None, replace: bool = True, p: Any = None) -> Any:
         pool = np.arange(a) if isinstance(a, int | np.integer) else np.asarray(a)
+        weights = None if p is None else [float(x) for x in p]
         if replace or size is None:
-            indices = self._each(lambda _: self._pick(len(pool), p), size, 0, dtype=int)
+            draw = self._script.branch
+            indices = self._each(lambda _: draw(weights or len(pool)), size, 0, dtype=int)
             return pool[indices]
-        indices = self._in_order(int(np.prod(size)), len(pool), None if p is None else list(p))
+        indices = self._in_order(int(np.prod(size)), len(pool), weights)
         return pool[indices].reshape(np.empty(size).shape + pool.shape[1:])
 
     def permutation(self, x: Any) -> Any:
@@ -220,7 +215,7 @@ class PythonDraws(NumpyDraws):
 
     def choices(self, population: Sequence[Any], weights: Any = None, *, k: int = 1) -> list[Any]:
         self._script.visit()
-        return [population[self._pick(len(population), weights)] for _ in range(k)]
+        return [population[self._script.branch(weights or len(population))] for _ in range(k)]
 
     def sample(self, population: Sequence[Any], k: int) -> list[Any]:
         return [population[i] for i in self._in_order(k, len(population))]

@@ -10,17 +10,18 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rl_yardstick.envs.model_of.draws import NEVER, Again, Suspect, take_step
-from rl_yardstick.envs.model_of.states import Refuted, Saved, State
+from rl_yardstick.envs.model_of.states import Refuted, State
 from rl_yardstick.envs.model_of.symbols import Drawn, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
-MOST_ENTRIES = 50_000_000  # of the arrays of a model
+MOST_ENTRIES = 200_000_000  # of the arrays of a model
 MOST_SPANS = 1000  # times at which one action can do different things, if episodes have no end
 LEVELS = (1e-6, 0.1, 0.3, 0.5, 0.7, 0.9, 1 - 1e-6)
 
@@ -115,20 +116,16 @@ class Tree:
             self._judge(*inner.args)
 
 
+@dataclass
 class Search:
     """Finds all states of an environment, and the outcomes of all actions."""
 
-    def __init__(
-        self,
-        state: State,
-        actions: list[Any],
-        seconds: float,
-        max_states: int,
-        progress: Callable[[int, int], None] | None,
-    ) -> None:
-        self.state, self.actions, self.script = state, actions, state.script
-        self.seconds, self.max_states, self.progress = seconds, max_states, progress
-        self.started = perf_counter()
+    state: State
+    actions: list[Any]
+    seconds: float
+    max_states: int
+    progress: Callable[[int, int], None] | None = None
+    started: float = field(default_factory=perf_counter)
 
     def run(self) -> tuple[TransitionModel, Bools]:
         """The model and the allowed actions, once no guess about the state proves wrong."""
@@ -137,20 +134,21 @@ class Search:
             try:
                 self._search()
                 self.state.check_constants()
+                self._check_reset()
                 return self._model()
             except Refuted as refuted:
                 self.state.used.add(refuted.args[0])
 
     def _search(self) -> None:
         self.index: dict[Hashable, int] = {}
-        self.saved: list[Saved] = []
+        self.saved: list[bytes] = []
         self.observations: list[Any] = []
         self.rows: list[list[Spans]] = []
         self.illegal: dict[str, int] = {}
         self.end = NEVER  # the time of the last step of the longest episode
         self.runs, self.check_every = 0, 256
-        start = self.state.copy(self.state.variables())
-        self.script.time = 0
+        start = self.state.save(self.state.variables())
+        self.state.script.time = 0
         self.initial = self._outcomes(start, None)
         while len(self.rows) < len(self.saved):
             state = len(self.rows)
@@ -161,12 +159,26 @@ class Search:
             if sum(lengths) > len(lengths) / 2:  # time matters all along
                 raise Refuted(next(iter(self.state.clocks)))
 
+    def _check_reset(self) -> None:
+        """A reset must lead to the same states from everywhere."""
+        n = len(self.saved)
+        if self._outcomes(self.saved[-1], None).keys() != self.initial.keys() and n < len(
+            self.saved
+        ):
+            starts = [self.state.saved(self.saved[outcome.state]) for outcome in self.initial]
+            for (_, name), value in self.state.saved(self.saved[n]).items():
+                known = {self.state.by_value(start.get((_, name))) for start in starts}
+                if self.state.by_value(value) not in known:
+                    raise Stop(
+                        f"`{name}` is kept over `reset`; does it matter? (ignore=['{name}'])"
+                    )
+
     def _spans(self, state: int, action: Any) -> Spans:
         """What the action does at each time; empty where it is not allowed."""
         spans: Spans = []
-        self.script.time = 0
-        while self.script.time <= self.end and self.script.time < NEVER:
-            time, self.script.until = self.script.time, NEVER
+        self.state.script.time = 0
+        while self.state.script.time <= self.end and self.state.script.time < NEVER:
+            time, self.state.script.until = self.state.script.time, NEVER
             try:
                 chances = self._outcomes(self.saved[state], action)
             except Exception as error:  # noqa: BLE001 (whatever it is, the action has no outcome)
@@ -179,22 +191,21 @@ class Search:
                     self.end = min(self.end, time)
             elif time == self.end or (len(spans) > MOST_SPANS and self.end == NEVER):
                 raise Refuted(next(iter(self.state.clocks)))
-            self.script.time = self.script.until + 1
+            self.state.script.time = self.state.script.until + 1
         return spans
 
-    def _outcomes(self, saved: Saved, action: Any) -> Chances:
+    def _outcomes(self, saved: bytes, action: Any) -> Chances:
         def run(choices: list[int], root: int, loops: dict[Any, bool]) -> Outcome:
-            self.script.begin(choices, root, loops)
+            self.state.script.begin(choices, root, loops)
             outcome = self._step(saved, action)
-            return self._linear(outcome, saved, action) if self.script.floats else outcome
+            return self._linear(outcome, saved, action) if self.state.script.floats else outcome
 
-        return Tree(run, lambda: self.script.trace).outcomes()
+        return Tree(run, lambda: self.state.script.trace).outcomes()
 
-    def _step(self, saved: Saved, action: Any) -> Outcome:
+    def _step(self, saved: bytes, action: Any) -> Outcome:
         """The outcome of one run under the script; a new state gets the next number."""
         self._tick()
         self.state.restore(saved)
-        self.state.set_clocks()
         result = take_step(self.state.layers[0], action)
         observation, reward, *ends = result[:4] if action is not None else (result[0], 0.0, 0, 0)
         reward = reward.item() if isinstance(reward, np.ndarray) else reward
@@ -208,23 +219,26 @@ class Search:
         if key not in self.index:
             if len(self.saved) >= self.max_states:
                 raise Stop(f"more than {self.max_states:,} states{self._growing()}")
-            self.saved.append(self.state.copy(variables))
+            self.saved.append(self.state.save(variables))
             self.observations.append(copy.deepcopy(observation))
         return Outcome(self.index.setdefault(key, len(self.index)), *moments)
 
-    def _linear(self, outcome: Outcome, saved: Saved, action: Any) -> Outcome:
+    def _linear(self, outcome: Outcome, saved: bytes, action: Any) -> Outcome:
         """The outcome of a run that made a float of a continuous number.
 
         Only the reward may depend on it, and linearly: then its mean and variance are known.
         """
-        number = self.script.floats[0]
-        plain = Drawn(self.script, list(number.known))
-        choices, points = [choice for choice, _ in self.script.trace], []
+        number = self.state.script.floats[0]
+        plain = Drawn(self.state.script, list(number.known))
+        choices, points = [choice for choice, _ in self.state.script.trace], []
         for level in LEVELS:
-            self.script.begin(choices, len(choices), {})
-            self.script.level = level
+            self.state.script.begin(choices, len(choices), {})
+            self.state.script.level = level
             other = self._step(saved, action)
-            if len(self.script.floats) > 1 or other._replace(reward=outcome.reward) != outcome:
+            if (
+                len(self.state.script.floats) > 1
+                or other._replace(reward=outcome.reward) != outcome
+            ):
                 number.now()
             points.append((plain.at(level), other.reward))
         (x0, y0), (x1, y1) = points[0], points[-1]
@@ -255,7 +269,7 @@ class Search:
         values: dict[str, set[Hashable]] = {}
         sample = self.saved[:: max(1, len(self.saved) // 500)]
         for saved in sample:
-            for (_, name), value in saved.items():
+            for (_, name), value in self.state.saved(saved).items():
                 values.setdefault(name, set()).add(self.state.by_value(value))
         name = max(values, key=lambda name: len(values[name]), default="")
         return f"; `{name}` has {len(values[name])} values in {len(sample)} of them" if name else ""
@@ -276,9 +290,8 @@ class Search:
 
     def _count_times(self) -> int:
         """At how many times the states of the model are told apart; 1 if time changes nothing."""
-        for spans in (spans for row in self.rows for spans in row):
-            ends = len(spans) == 2 and spans[1][0] == self.end
-            if len(spans) > 2 or (len(spans) == 2 and not (ends and _same_rewards(*spans))):
+        for (_, usual), *later in (spans for row in self.rows for spans in row if spans):
+            if any(first < self.end or not _alike(usual, chances) for first, chances in later):
                 if self.end == NEVER:
                     raise Refuted(next(iter(self.state.clocks)))
                 return self.end + 1
@@ -290,43 +303,30 @@ class Search:
         self.times = times
         most = max(len(chances) for row in self.rows for spans in row for _, chances in spans)
         shape = times, n, len(self.actions), most
-        if np.prod(shape, dtype=float) > MOST_ENTRIES:
+        if 5 * np.prod(shape, dtype=float) > MOST_ENTRIES:
             raise Stop(f"a model of {n:,} states at {times:,} times, {most} outcomes is too large")
-        prob, reward, variance = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        following, ends = np.zeros(shape, np.int64), np.ones(shape, np.bool_)
-        prob[..., 0] = 1.0  # of actions that are not allowed
-        later = np.minimum(np.arange(1, times + 1), times - 1) * n
-        for s, row in enumerate(self.rows):
-            for a, spans in enumerate(row):
+        table = np.zeros((5, *shape))  # probability, reward, variance, end, next state
+        table[0, ..., 0] = table[3] = 1.0  # of actions that are not allowed
+        for s, actions in enumerate(self.rows):
+            for a, spans in enumerate(actions):
                 for first, chances in spans:
-                    for k, (outcome, p) in enumerate(chances.items()):
-                        at = slice(first, None), s, a, k
-                        prob[at], reward[at], variance[at] = p, outcome.reward, outcome.variance
-                        following[at] = later[first:] + max(outcome.state, 0)
-                        ends[at] = outcome.state < 0
-                    prob[first:, s, a, len(chances) :] = 0.0
-        prob /= prob.sum(axis=3, keepdims=True)
+                    row = [(p, *o[1:3], o.state < 0, max(o.state, 0)) for o, p in chances.items()]
+                    table[:, first:, s, a] = 0.0
+                    table[:, first:, s, a, : len(row)] = np.transpose(row)[:, None]
+        table[0] /= table[0].sum(axis=3, keepdims=True)
+        table[4] += n * np.minimum(np.arange(times) + 1, times - 1)[:, None, None, None]
+        prob, reward, variance, ends, following = table.reshape(5, times * n, *shape[2:])
         initial = np.zeros(times * n)
         for outcome, p in self.initial.items():
-            initial[outcome.state] = p
-        mask = np.tile([[bool(spans) for spans in row] for row in self.rows], (times, 1))
-        flat = times * n, *shape[2:]
+            initial[outcome.state] = p / sum(self.initial.values())
+        noise = variance if variance.any() else None
         model = TransitionModel(
-            prob.reshape(flat),
-            following.reshape(flat),
-            reward.reshape(flat),
-            ends.reshape(flat),
-            initial / initial.sum(),
-            variance.reshape(flat) if variance.any() else None,
+            prob, following.astype(np.int64), reward, ends.astype(np.bool_), initial, noise
         )
-        return model, mask
+        return model, np.tile([[bool(spans) for spans in row] for row in self.rows], (times, 1))
 
 
-def _same_rewards(one: tuple[int, Chances], other: tuple[int, Chances]) -> bool:
-    """Whether both give the same rewards with the same chances, wherever they lead."""
-    sums: list[Chances] = [{}, {}]
-    for (_, chances), total in zip((one, other), sums, strict=True):
-        for outcome, p in chances.items():
-            key = outcome._replace(state=0, truncated=False)
-            total[key] = round(total.get(key, 0.0) + p, 12)
-    return sums[0] == sums[1]
+def _alike(one: Chances, other: Chances) -> bool:
+    """Whether both earn the same rewards and end as often, whatever else they do."""
+    a, b = (sum(p * np.array([o.reward, o.terminated]) for o, p in x.items()) for x in (one, other))
+    return bool(np.allclose(a, b, rtol=1e-12, atol=1e-12))

@@ -12,8 +12,9 @@ it then belongs to the state, and the search starts anew.
 
 from __future__ import annotations
 
-import copy
 import enum
+import io
+import pickle
 import types
 from collections import deque
 from collections.abc import Hashable, Iterable, Iterator
@@ -54,6 +55,11 @@ class Ghost(Symbol):
 
     def append(self, item: Any) -> None:
         """Nobody reads what is appended."""
+
+    def _used(self, *given: Any) -> Any:
+        raise Refuted(self.known)
+
+    __getattr__ = __len__ = __getitem__ = __setitem__ = __iter__ = __contains__ = _used
 
 
 class Clock(Symbol):
@@ -172,28 +178,21 @@ class State:
         self.watched[place] = vars(self.layers[place[0]]).pop(place[1])
         return property(read, write)
 
-    def set_clocks(self) -> None:
-        """Let the clocks show the script's time."""
-        for place, start in self.clocks.items():
-            self.watched[place] = Clock(self.script, None, 1, start)
-
     def check_clocks(self, is_reset: bool) -> None:
         """Every clock must have counted the step, or start anew."""
         for place, start in self.clocks.items():
             value = self.watched[place]
-            if isinstance(value, Clock):
-                right = not is_reset and (value.scale, value.shift) == (1, start + 1)
+            if is_reset or not isinstance(value, Clock):
+                right = is_reset and type(value) is int and value == start
             else:
-                right = is_reset and value == start
+                right = (value.scale, value.shift) == (1, start + 1)
             if not right:
                 raise Refuted(place)
 
     def check_constants(self) -> None:
         """Constants must not have changed in place."""
         kept, self.kept = self.kept, {}
-        wrong = [
-            p for p, (value, before) in self.constants.items() if self.by_value(value) != before
-        ]
+        wrong = [p for p, (value, held) in self.constants.items() if self.by_value(value) != held]
         self.kept = kept
         if wrong:
             raise Refuted(wrong[0])
@@ -218,27 +217,41 @@ class State:
             [(place, self.by_value(variables[place], seen)) for place in sorted(variables)]
         )
 
-    def copy(self, values: Saved) -> Saved:
-        """A copy of a state, in which constants stay the objects that they are."""
-        if all(isinstance(value, np.generic) or type(value) in ATOMS for value in values.values()):
-            return dict(values)
+    def save(self, variables: Saved) -> bytes:
+        """A state to restore, in which constants are the objects that they were."""
+        file = io.BytesIO()
+        pickler: Any = pickle.Pickler(file)
+        pickler.persistent_id = self._reference
         try:
-            return copy.deepcopy(values, dict(self.kept))
-        except (TypeError, AttributeError, copy.Error) as error:
-            if len(values) == 1:
-                raise Stop(f"`{next(iter(values))[1]}` cannot be saved: {error}") from None
-            for place, value in values.items():
-                self.copy({place: value})
-            raise
+            pickler.dump(variables)
+        except (TypeError, AttributeError, pickle.PicklingError) as error:
+            for place, value in variables.items() if len(variables) > 1 else ():
+                self.save({place: value})
+            raise Stop(f"`{next(iter(variables))[1]}` cannot be saved: {error}") from None
+        return file.getvalue()
 
-    def restore(self, saved: Saved) -> None:
-        """Put a saved state into the environment."""
-        values = self.copy(saved)
+    def _reference(self, value: Any) -> int | None:
+        if isinstance(value, (*BY_IDENTITY, *GENERATORS)):
+            self.kept[id(value)] = value
+        return id(value) if id(value) in self.kept else None
+
+    def saved(self, saved: bytes) -> Saved:
+        """The attributes of a saved state."""
+        unpickler: Any = pickle.Unpickler(io.BytesIO(saved))  # noqa: S301 (its own, in memory)
+        unpickler.persistent_load = self.kept.__getitem__
+        values: Saved = unpickler.load()
+        return values
+
+    def restore(self, saved: bytes) -> None:
+        """Put a saved state into the environment, whose clocks show the script's time."""
+        values = self.saved(saved)
         for (i, name), _ in self.attributes():
             if (i, name) not in values and (i, name) not in self.constants:
                 del vars(self.layers[i])[name]
         for (i, name), value in values.items():
             vars(self.layers[i])[name] = value
+        for place, start in self.clocks.items():
+            self.watched[place] = Clock(self.script, None, 1, start)
 
     def by_value(self, value: Any, seen: dict[int, Any] | None = None) -> Hashable:
         """Something hashable that is equal for equal values; which parts are shared counts."""

@@ -1,18 +1,16 @@
-"""Random numbers that are known by their distribution only, until a value is needed.
+"""Numbers without a value: continuous draws, and what stands in for watched attributes.
 
-Comparing or rounding such a number branches with the exact probability of each side, and narrows
-what is known of it: ``u < 0.3``, ``int(6 * u)``, ``searchsorted(cdf, u)`` and ``round(normal)``
-have as many outcomes as they can show. Whole numbers (`Count`) are split by comparisons, so that
-``min(demand, stock)`` has stock + 1 outcomes, and take a value for everything else.
+A continuous number is known by its distribution only. Comparing or rounding it branches with the
+exact probability of each side, and narrows what is known of it: ``u < 0.3``, ``int(6 * u)``,
+``searchsorted(cdf, u)`` and ``round(normal)`` have as many outcomes as they can show.
 """
 
 from __future__ import annotations
 
-import functools
-import itertools
 import math
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any, NamedTuple, Self
@@ -40,7 +38,7 @@ class Symbol(NDArrayOperatorsMixin):
     """The number ``scale * x + shift``; numbers made from one draw share what is known of x.
 
     Every operator and NumPy function of it comes to `__array_ufunc__`. A subclass has ``now()``, a
-    value chosen by the script, and ``below(cut, closed)``: whether x < cut, or x <= cut if closed.
+    value or a refusal, and ``below(cut, closed)``: whether x < cut, or x <= cut if closed.
     """
 
     now: Callable[[], Any]
@@ -61,6 +59,8 @@ class Symbol(NDArrayOperatorsMixin):
         return is_below if self.scale > 0 else np.logical_not(is_below)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **keywords: Any) -> Any:
+        if isinstance(keywords.get("out", (None,))[0], Symbol):
+            del keywords["out"]  # `x += 1` makes a new number
         rule = (DRAWN_RULES if isinstance(self, Drawn) else RULES).get(ufunc)
         if rule is None or method != "__call__" or keywords:
             inputs = tuple(x.now() if isinstance(x, Symbol) else x for x in inputs)
@@ -72,13 +72,8 @@ class Symbol(NDArrayOperatorsMixin):
     def __bool__(self) -> bool:
         return bool(self != 0)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
-        return self.now()
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return getattr(np.asarray(self.now())[()], name)
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return self.now().__reduce_ex__(protocol)
 
 
 def _value_method(name: str) -> Callable[..., Any]:
@@ -91,19 +86,19 @@ for _name in ["int", "float", "index", "hash", "str", "format", "round", "floor"
 
 def _add(a: Any, b: Any, sign: int = 1) -> Any:
     if not isinstance(b, Symbol):
-        return a.linear(1, sign * b) if isinstance(a, Symbol) else a + sign * b
+        return a.linear(1, sign * b)
     if not isinstance(a, Symbol):
         return b.linear(sign, a)
     if a.known is b.known:
         return type(a)(a.script, a.known, a.scale + sign * b.scale, a.shift + sign * b.shift)
-    return _add(a, b.now(), sign) if isinstance(a, Drawn) else _add(a.now(), b, sign)
+    return a + sign * b.now() if isinstance(a, Drawn) else a.now() + sign * b
 
 
 def _multiply(a: Any, b: Any) -> Any:
     a, b = (a, b) if isinstance(a, Symbol) else (b, a)
-    if isinstance(b, Symbol):
-        return a * b.now() if isinstance(a, Drawn) else a.now() * b
-    return a.linear(b, 0) if np.ndim(b) == 0 else a.now() * b
+    if isinstance(b, Symbol) or np.ndim(b):
+        return a.now() * b
+    return a.linear(b, 0)
 
 
 def _less(a: Any, b: Any, or_equal: bool = False) -> Any:
@@ -122,17 +117,17 @@ RULES: dict[np.ufunc, Callable[..., Any]] = {
     np.subtract: lambda a, b: _add(a, b, -1),
     np.multiply: _multiply,
     np.negative: lambda a: a.linear(-1, 0),
-    np.absolute: lambda a: -a if _less(a, 0) else a,
     np.less: _less,
     np.less_equal: lambda a, b: _less(a, b, or_equal=True),
     np.greater: lambda a, b: _less(b, a),
     np.greater_equal: lambda a, b: _less(b, a, or_equal=True),
     np.equal: _equal,
     np.not_equal: lambda a, b: np.logical_not(_equal(a, b)),
-    np.maximum: lambda a, b: b if _less(a, b) else a,
-    np.minimum: lambda a, b: a if _less(a, b) else b,
 }
 DRAWN_RULES: dict[np.ufunc, Callable[..., Any]] = RULES | {
+    np.absolute: lambda a: -a if a < 0 else a,
+    np.maximum: lambda a, b: b if a < b else a,
+    np.minimum: lambda a, b: a if a < b else b,
     np.divide: lambda a, b: a.linear(1 / b, 0),
     np.floor: lambda a: float(math.floor(a)),
     np.ceil: lambda a: float(math.ceil(a)),
@@ -143,7 +138,7 @@ DRAWN_RULES: dict[np.ufunc, Callable[..., Any]] = RULES | {
 
 
 class Law(NamedTuple):
-    """A continuous distribution of mean ``mean``."""
+    """A continuous distribution."""
 
     cdf: Callable[[float], float]
     quantile: Callable[[float], float]
@@ -162,8 +157,7 @@ class Drawn(Symbol):
         """Branch over the intervals between these quantiles, and narrow what is known."""
         low, high = self.known[1:3]
         bounds = [low, *sorted({q for q in at if low < q < high}), high]
-        chances = [(b - a) / (high - low) for a, b in itertools.pairwise(bounds)]
-        interval = self.script.branch(chances)
+        interval = self.script.branch([b - a for a, b in pairwise(bounds)])
         self.known[1:3] = bounds[interval : interval + 2]
 
     def below(self, cut: Any, closed: bool) -> Any:
@@ -218,39 +212,3 @@ class Drawn(Symbol):
         else:
             raise Stop(f"{place} draws a continuous reward that is cut off at a bound")
         return self.scale * mean + self.shift, self.scale**2 * variance
-
-
-@functools.cache
-def table(name: str, *parameters: float) -> tuple[int, list[float]]:
-    """The lowest value of one of SciPy's distributions, and the chances to lie below each value."""
-    from scipy import stats
-
-    law = getattr(stats, name)(*parameters)
-    low, high = int(law.support()[0]), int(law.isf(TAIL))
-    chances = law.pmf(np.arange(low, high + 1))
-    return low, [0.0, *np.cumsum(chances / chances.sum()).tolist()]
-
-
-class Count(Symbol):
-    """A whole random number; known are its lowest and highest value and its `table`."""
-
-    def below(self, cut: Any, closed: bool) -> Any:
-        if np.ndim(cut):
-            self.now()
-            return self.known[0] <= cut if closed else self.known[0] < cut
-        first, last, (low, under) = self.known
-        cut = math.floor(cut) + 1 if closed else math.ceil(cut)
-        if not first < cut <= last:
-            return cut > last
-        a, b, c = (under[i - low] for i in (first, cut, last + 1))
-        is_below = self.script.branch([(b - a) / (c - a), (c - b) / (c - a)]) == 0
-        self.known[1 if is_below else 0] = cut - is_below
-        return is_below
-
-    def now(self) -> Any:
-        first, last, (low, under) = self.known
-        inside = under[first - low : last + 2 - low]
-        total = inside[-1] - inside[0]
-        chances = [(b - a) / total for a, b in itertools.pairwise(inside)]
-        self.known[:2] = [first + self.script.branch(chances)] * 2
-        return self.scale * self.known[0] + self.shift
