@@ -1,5 +1,8 @@
 """The models that `model_of` finds, against published models and figures known by other means."""
 
+import re
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -8,8 +11,9 @@ import pytest
 from gymnasium import spaces
 
 import rl_yardstick.envs
-from rl_yardstick.envs.known_models import transition_model
-from rl_yardstick.envs.model_of import FoundModel, model_of
+from rl_yardstick.envs.known_models import observations_of_states, transition_model
+from rl_yardstick.envs.model_of import FoundModel, NotFinite, model_of
+from rl_yardstick.envs.model_of.check import Check
 from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
 from rl_yardstick.mdp.transition_model import TransitionModel
 
@@ -165,3 +169,207 @@ def test_tic_tac_toe() -> None:
     assert found.model.n_states == 2423
     assert optimum(found, 9) == pytest.approx(0.9947917, abs=1e-7)
     assert "not allowed: ValueError: that square is taken" in found.notes[0]
+
+
+OWN = ["Warehouse-v0", "DynaMaze-v0", "WindyGridworld-v0", "RiverSwim-v0", "RandomWalk-v0"]
+OWN += ["DeepSea-v0", "MaximizationBias-v0"]
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_environments_of_this_project(name: str) -> None:
+    env = gym.make(name)
+    same_model(model_of(env, **PATIENT), transition_model(env), observations_of_states(env))
+
+
+class World(gym.Env):
+    """A world of one number, made of a rule for its step; the reset sets the number to 0."""
+
+    def __init__(self, rule: Callable[..., Any], states: int = 50, actions: int = 2) -> None:
+        self.rule = rule
+        self.observation_space = spaces.Discrete(states)
+        self.action_space = spaces.Discrete(actions)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.x, self.time, self.total = 0, 0, 0.0
+        return self.x, {}
+
+    def step(self, action: int) -> Any:
+        self.time += 1
+        reward, terminated, truncated = self.rule(self, self.np_random, action)
+        self.total += reward
+        return self.x, reward, terminated, truncated, {"total": self.total}
+
+
+def once(draw: Callable[[np.random.Generator], Any]) -> World:
+    """An episode of one step, which earns 1 with an unknown probability, or another reward."""
+    return World(lambda world, rng, action: (draw(rng), True, False))
+
+
+def truncated_normal(rng: np.random.Generator) -> float:
+    return float(round(max(rng.normal(1.0, 2.0), 0.0)) == 0)
+
+
+DRAWS: dict[str, tuple[Callable[[Any], Any], float]] = {
+    "u < 0.3": (lambda rng: float(rng.random() < 0.3), 0.3),
+    "a narrow interval": (lambda rng: float(0.123 < rng.random() < 0.12301), 1e-5),
+    "int(6 * u)": (lambda rng: int(6 * rng.random()), 2.5),
+    "searchsorted": (lambda rng: np.searchsorted([0.1, 0.6, 1.0], rng.random()), 0.5 + 2 * 0.4),
+    "argmax": (lambda rng: np.argmax(np.array([0.1, 0.6, 1.0]) > rng.random()), 0.5 + 2 * 0.4),
+    "round(normal)": (lambda rng: float(round(rng.normal(1.0, 2.0)) == 1), 0.19741265136584744),
+    "max(normal, 0)": (truncated_normal, 0.4012936743170763),
+    "a Gaussian reward": (lambda rng: 2 * rng.normal(1.0, 3.0) + 1, 3.0),
+    "a Gaussian reward as a float": (lambda rng: 5 - float(rng.normal(1.0, 3.0)), 4.0),
+    "min(poisson, 1)": (lambda rng: min(rng.poisson(2.0), 1), 1 - np.exp(-2)),
+    "binomial": (lambda rng: float(rng.binomial(10, 0.3) == 4), 210 * 0.3**4 * 0.7**6),
+    "choice with chances": (lambda rng: rng.choice([5.0, 7.0], p=[0.25, 0.75]), 6.5),
+    "two of four": (lambda rng: sum(rng.choice(4, 2, replace=False)), 3.0),
+    "two dice": (lambda rng: float(sum(rng.integers(1, 7) for _ in range(2)) == 7), 1 / 6),
+    "until a six": (lambda rng: float(any(rng.integers(6) == 5 for _ in iter(int, 1))), 1.0),
+    "shuffled": (lambda rng: float(rng.permutation(4)[0]), 1.5),
+}
+
+
+@pytest.mark.parametrize("name", DRAWS)
+def test_draws(name: str) -> None:
+    draw, mean = DRAWS[name]
+    found = model_of(once(draw), **PATIENT)
+    assert found.model.n_states == 1
+    assert found.model.expected_reward[0] == pytest.approx(mean, abs=1e-12)
+    if "Gaussian" in name:
+        factor = 1 if "float" in name else 2
+        assert found.model.reward_variance[0, 0, 0] == pytest.approx((factor * 3.0) ** 2)
+
+
+def walk(world: Any, rng: Any, action: int) -> Any:
+    world.x = min(max(world.x + (1 if rng.random() < (0.9, 0.2)[action] else -1), 0), 9)
+    return float(world.x), False, world.time >= 30
+
+
+def bonus(world: Any, rng: Any, action: int) -> Any:
+    """The reward of the goal falls with the time."""
+    world.x = min(max(world.x + 2 * action - 1, 0), 3)
+    return (1 - 0.01 * world.time) * (world.x == 3), world.x == 3, world.time >= 30
+
+
+def test_a_counter_of_steps_is_no_state() -> None:
+    found = model_of(World(walk), **PATIENT)
+    assert (found.model.n_states, found.horizon) == (10, 30)
+    assert found.notes == ["`time` counts the steps: episodes end after 30"]
+
+
+def test_a_counter_that_rewards_depend_on() -> None:
+    found = model_of(World(bonus), **PATIENT)
+    assert (found.model.n_states, found.horizon, len(found.observations)) == (90, 30, 90)
+    assert optimum(found) == pytest.approx(0.97, abs=1e-12)
+
+
+def climb(world: Any, rng: Any, action: int) -> Any:
+    world.x += action
+    return 0.0, False, False
+
+
+def drift(world: Any, rng: Any, action: int) -> Any:
+    world.x += rng.normal()
+    return 0.0, False, False
+
+
+def unpicklable(world: Any, rng: Any, action: int) -> Any:
+    world.stream = getattr(world, "stream", None) or iter(x for x in range(9))
+    world.x = next(world.stream) % 3
+    return 0.0, world.x == 2, False
+
+
+def shuffled(world: Any, rng: Any, action: int) -> Any:
+    rng.shuffle(list(range(52)))
+    return 0.0, True, False
+
+
+class Hidden:
+    steps = 0
+
+
+def hidden(world: Any, rng: Any, action: int) -> Any:
+    Hidden.steps += 1
+    return float(Hidden.steps % 7 == 0), Hidden.steps % 5 == 0, False
+
+
+def endless(world: Any, rng: Any, action: int) -> Any:
+    world.x = rng.integers(5) + rng.integers(9000) + rng.integers(9000)
+    return 0.0, False, False
+
+
+REFUSALS: dict[str, tuple[Callable[..., Any], str]] = {
+    "continuous": (drift, r"test_model_of.py:\d+ draws a continuous number, which reaches the st"),
+    "too many states": (climb, r"more than 1,000 states; `x` has \d+ values in \d+ of them"),
+    "not saved": (unpicklable, r"`stream` cannot be saved: cannot pickle 'generator' object"),
+    "orders": (shuffled, r"test_model_of.py:\d+ shuffles 52 things: too many orders"),
+    "outside": (hidden, r"something outside its attributes decides what it does: state 0, action "),
+    "no end": (endless, r"no end after 2 seconds: `reset` has more than"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_refusals(name: str) -> None:
+    rule, message = REFUSALS[name]
+    with pytest.raises(NotFinite, match=message):
+        model_of(World(rule), seconds=2.0, max_states=1000 if "states" in name else 10**6)
+
+
+class Record(World):
+    """Keeps its best position over the reset."""
+
+    best = 0
+
+    def step(self, action: int) -> Any:
+        self.x = self.best = max(self.best, action)
+        return self.x, 0.0, action == 0, False, {}
+
+
+def test_what_is_kept_over_the_reset_is_named() -> None:
+    env = Record(climb)
+    env.best = 0
+    with pytest.raises(NotFinite, match="`best` is kept over `reset`"):
+        model_of(env, **PATIENT)
+
+
+@pytest.mark.parametrize("shift", [0.1, -0.1])
+def test_a_shift_of_ten_percent_is_caught(shift: float) -> None:
+    env = gym.make("FrozenLake-v1").unwrapped
+    found = model_of(env)
+    prob = found.model.prob.copy()
+    prob[..., 0] *= np.where(found.model.prob[..., 0] < 1, 1 + shift, 1)
+    rest = found.model.prob[..., 1:].sum(axis=2)
+    prob[..., 1:] *= np.divide(1 - prob[..., 0], rest, out=np.ones_like(rest), where=rest > 0)[
+        ..., None
+    ]
+    numbers = {observation: state for state, observation in enumerate(found.observations)}
+    for p, refuted in ((found.model.prob, False), (prob, True)):
+        check = Check(
+            env,
+            replace(found.model, prob=p),
+            lambda observation, _: numbers.get(observation),
+            found.actions,
+            np.ones((11, 4), bool),
+        )
+        assert (check.refutation() is not None) == refuted
+
+
+def test_one_impossible_step_refutes() -> None:
+    env = gym.make("FrozenLake-v1").unwrapped
+    model = transition_model(gym.make("FrozenLake-v1", is_slippery=False))
+    check = Check(env, model, lambda state, _: state, [0, 1, 2, 3], np.ones((16, 4), bool))
+    assert re.fullmatch(
+        r"state \d+, action \d: the model has no step to \d+ .*, the environment made one",
+        check.refutation(),
+    )
+
+
+def test_the_environment_is_left_as_it_was() -> None:
+    env = gym.make("Taxi-v4")
+    kinds = type(env), type(env.env), type(env.unwrapped), env.unwrapped.np_random
+    model_of(env, **PATIENT)
+    assert (type(env), type(env.env), type(env.unwrapped), env.unwrapped.np_random) == kinds
+    assert isinstance(env.env.env, gym.Wrapper)
+    env.reset(seed=1)
+    env.step(0)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rl_yardstick.envs.model_of.draws import NEVER, Again, Suspect, take_step
-from rl_yardstick.envs.model_of.states import Refuted, State
+from rl_yardstick.envs.model_of.states import Refuted, Saved, State
 from rl_yardstick.envs.model_of.symbols import Drawn, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
@@ -161,17 +161,17 @@ class Search:
 
     def _check_reset(self) -> None:
         """A reset must lead to the same states from everywhere."""
-        n = len(self.saved)
-        if self._outcomes(self.saved[-1], None).keys() != self.initial.keys() and n < len(
-            self.saved
-        ):
-            starts = [self.state.saved(self.saved[outcome.state]) for outcome in self.initial]
-            for (_, name), value in self.state.saved(self.saved[n]).items():
-                known = {self.state.by_value(start.get((_, name))) for start in starts}
-                if self.state.by_value(value) not in known:
-                    raise Stop(
-                        f"`{name}` is kept over `reset`; does it matter? (ignore=['{name}'])"
-                    )
+        for outcome in self._outcomes(self.saved[-1], None):
+            if outcome not in self.initial:
+                self._refuse_start(self.state.saved(self.saved[outcome.state]))
+
+    def _refuse_start(self, variables: Saved) -> None:
+        """Name the attribute that no start of an episode has."""
+        starts = [self.state.saved(self.saved[outcome.state]) for outcome in self.initial]
+        for place, value in variables.items():
+            known = {self.state.by_value(start.get(place)) for start in starts}
+            if self.state.by_value(value) not in known:
+                raise Stop(f"`{place[1]}` is kept over `reset` (ignore it if it changes nothing)")
 
     def _spans(self, state: int, action: Any) -> Spans:
         """What the action does at each time; empty where it is not allowed."""
@@ -277,9 +277,13 @@ class Search:
     def state_now(self, observation: Any, time: int) -> int | None:
         """The number in the model of the state that the environment is in; None if unknown."""
         try:
-            key = self.state.key(self.state.variables()), self.state.by_value(observation)
-        except Refuted:
-            return None
+            variables = self.state.variables()
+        except Refuted as refuted:
+            name = refuted.args[0][1]
+            raise Stop(f"`{name}` is kept over `reset` (ignore it if it changes nothing)") from None
+        key = self.state.key(variables), self.state.by_value(observation)
+        if time == 0 and key not in self.index:
+            self._refuse_start(variables)
         state = self.index.get(key)
         return None if state is None else min(time, self.times - 1) * len(self.rows) + state
 

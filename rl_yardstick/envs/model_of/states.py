@@ -67,7 +67,7 @@ class Clock(Symbol):
 
     def now(self) -> Any:
         self.script.until = self.script.time
-        return self.script.time + self.shift
+        return self.scale * self.script.time + self.shift
 
     def below(self, cut: float, closed: bool) -> bool:
         last = np.floor(cut) if closed else np.ceil(cut) - 1  # the last time below

@@ -98,7 +98,7 @@ def _multiply(a: Any, b: Any) -> Any:
     a, b = (a, b) if isinstance(a, Symbol) else (b, a)
     if isinstance(b, Symbol) or np.ndim(b):
         return a.now() * b
-    return a.linear(b, 0)
+    return a.linear(b, 0) if b else 0 * b
 
 
 def _less(a: Any, b: Any, or_equal: bool = False) -> Any:
@@ -178,7 +178,7 @@ class Drawn(Symbol):
         return int(self.at(0.5) // 1)
 
     def __ceil__(self) -> int:
-        return -int(math.floor(-self))
+        return -(-self).__floor__()
 
     def __trunc__(self) -> int:
         return math.ceil(self) if self < 0 else math.floor(self)
