@@ -3,9 +3,9 @@
     found = model_of(gym.make("Taxi-v4", fickle_passenger=True))
     found.model  # a `TransitionModel`
 
-`draws` lets every generator follow a script, `symbols` are random numbers that need no value,
-`states` decides which attributes are the state, `search` finds the states and outcomes, and `check`
-tests the model against the untouched environment.
+`draws` lets every generator follow a script, `symbols` are numbers that need no value, `states`
+decides which attributes are the state, `search` finds the states and outcomes, and `check` tests
+the model against the untouched environment.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rl_yardstick.envs.model_of.check import Check
+from rl_yardstick.envs.model_of.check import refutation
 from rl_yardstick.envs.model_of.draws import Script, scripted
 from rl_yardstick.envs.model_of.search import Search
 from rl_yardstick.envs.model_of.states import State, parts_of
@@ -29,6 +29,7 @@ from rl_yardstick.envs.model_of.symbols import Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 MOST_ACTIONS = 5000
+OUTSIDE = "something outside its attributes decides (a class, a global, the time of day)"
 
 
 class NotFinite(Exception):  # noqa: N818 (says what is wrong with the environment)
@@ -39,23 +40,16 @@ class NotFinite(Exception):  # noqa: N818 (says what is wrong with the environme
 class FoundModel:
     """The exact model of an environment, without the time limit of `gymnasium.make`.
 
-    Attributes:
-        model: the dynamics. Where the environment's own time matters for more than the end of the
-            episode, every state stands there once for each time.
-        mask: actions that raise no error, bool of shape (S, A); None if all are allowed.
-        observations: what each state shows.
-        actions: the environment's actions, in the order of the model.
-        horizon: the environment's own limit on steps, None without one.
-        notes: what a reader of the figures should know, a sentence each.
-        seconds: the time that it took.
+    Where the environment's own time matters for more than the end of the episode, every state
+    stands in the model once for each time.
     """
 
     model: TransitionModel
-    mask: Bools | None
-    observations: list[Any]
-    actions: list[Any]
-    horizon: int | None
-    notes: list[str]
+    mask: Bools | None  # actions that raise no error, bool of shape (S, A); None if all
+    observations: list[Any]  # what each state shows
+    actions: list[Any]  # of the environment, in the order of the model
+    horizon: int | None  # the environment's own limit on steps
+    notes: list[str]  # what a reader of the figures should know
     seconds: float
 
 
@@ -69,11 +63,9 @@ def model_of(
 ) -> FoundModel:
     """The exact model of a finite environment, found by running its `reset` and `step`.
 
-    The environment is to be reset afterwards.
-
     Args:
-        env: the environment; wrappers are part of it, but for time limits and those that only
-            watch.
+        env: the environment, to be reset afterwards; wrappers are part of it, but for time limits
+            and those that only watch.
         seconds: the time after which the search gives up.
         max_states: the number of states above which it gives up.
         ignore: names of attributes that change nothing.
@@ -93,36 +85,24 @@ def model_of(
         with scripted(state.script, [*held, *(sys.modules[name] for name in modules)]):
             model, mask = search.run()
         state.restore_original(without_transparent=True)
-        problem = Check(state.layers[0], model, search.state_now, actions, mask).refutation()
+        if problem := refutation(state.layers[0], model, search.state_now, actions, mask):
+            raise NotFinite(f"{OUTSIDE}: {problem}")
     except Stop as stop:
         raise NotFinite(str(stop)) from None
     finally:
         state.restore_original(without_transparent=False)
-    if problem:
-        raise NotFinite(f"something outside its attributes decides what it does: {problem}")
-    return FoundModel(
-        model,
-        None if mask.all() else mask,
-        search.observations * search.times,
-        actions,
-        search.horizon,
-        _notes(search),
-        perf_counter() - search.started,
-    )
-
-
-def _notes(search: Search) -> list[str]:
-    """What a reader of the figures should know."""
     notes = []
-    names = ", ".join(f"`{name}`" for _, name in search.state.clocks)
     if search.horizon is not None:
+        names = ", ".join(f"`{name}`" for _, name in state.clocks)
         notes.append(f"{names} counts the steps: episodes end after {search.horizon}")
-    n, shown = len(search.observations), search.observations
-    if (seen := len({search.state.by_value(observation) for observation in shown})) < n:
+    n, seen = len(search.observations), len(set(map(state.by_value, search.observations)))
+    if seen < n:
         notes.append(f"{n:,} states stand behind {seen:,} observations")
-    for error, times in search.illegal.items():
-        notes.append(f"{times:,} pairs of state and action are not allowed: {error}")
-    return notes
+    for error, pairs in search.illegal.items():
+        notes.append(f"{pairs:,} pairs of state and action are not allowed: {error}")
+    observations, spent = search.observations * search.times, perf_counter() - search.started
+    allowed = None if mask.all() else mask
+    return FoundModel(model, allowed, observations, actions, search.horizon, notes, spent)
 
 
 def _actions_of(space: gym.Space[Any]) -> list[Any]:
@@ -132,7 +112,4 @@ def _actions_of(space: gym.Space[Any]) -> list[Any]:
     if isinstance(space, spaces.MultiDiscrete) and np.prod(space.nvec) <= MOST_ACTIONS:
         values = itertools.product(*(range(n) for n in space.nvec.ravel()))
         return [np.array(value).reshape(space.nvec.shape) + space.start for value in values]
-    if isinstance(space, spaces.MultiBinary) and 2 ** np.prod(space.shape) <= MOST_ACTIONS:
-        bits = itertools.product((0, 1), repeat=int(np.prod(space.shape)))
-        return [np.array(value, np.int8).reshape(space.shape) for value in bits]
     raise NotFinite(f"the action space {space} is not finite, or has over {MOST_ACTIONS:,} actions")

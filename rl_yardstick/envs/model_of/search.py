@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rl_yardstick.envs.model_of.draws import NEVER, Again, Suspect, take_step
+from rl_yardstick.envs.model_of.draws import NEVER, Again, Script, Suspect, take_step
 from rl_yardstick.envs.model_of.states import Refuted, Saved, State
 from rl_yardstick.envs.model_of.symbols import Drawn, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
@@ -44,8 +44,8 @@ Run = Callable[[list[int], int, dict[Any, bool]], Outcome]
 class Tree:
     """The tree of draws below one action in one state."""
 
-    def __init__(self, run: Run, trace: Callable[[], Any]) -> None:
-        self.run, self.trace = run, trace
+    def __init__(self, run: Run, script: Script) -> None:
+        self.run, self.script = run, script
         self.loops: dict[Any, bool] = {}
 
     def outcomes(self) -> Chances:
@@ -76,7 +76,7 @@ class Tree:
         chosen, shares = trace[depth]
         total: Chances = {}
         returned: Chances = {}
-        for choice, p in enumerate([1 / shares] * shares if isinstance(shares, int) else shares):
+        for choice, p in enumerate(shares):
             if p > 0:
                 known = leaf if choice == chosen else None
                 below = self._below([*choices, choice], root, back, known)
@@ -93,9 +93,9 @@ class Tree:
     def _leaf(self, choices: list[int], root: int) -> Any:
         """One run: its outcome, or the node that it came back to, and its trace."""
         try:
-            return self.run(choices, root, self.loops), -1, self.trace()
+            return self.run(choices, root, self.loops), -1, self.script.trace
         except Again as again:
-            return None, again.args[0], self.trace()
+            return None, again.args[0], self.script.trace
 
     def _judge(self, place: Any, first: int, choices: list[int]) -> None:
         """Whether a second visit starts again from the first: then the same must follow both."""
@@ -200,7 +200,7 @@ class Search:
             outcome = self._step(saved, action)
             return self._linear(outcome, saved, action) if self.state.script.floats else outcome
 
-        return Tree(run, lambda: self.state.script.trace).outcomes()
+        return Tree(run, self.state.script).outcomes()
 
     def _step(self, saved: bytes, action: Any) -> Outcome:
         """The outcome of one run under the script; a new state gets the next number."""

@@ -125,15 +125,12 @@ RULES: dict[np.ufunc, Callable[..., Any]] = {
     np.not_equal: lambda a, b: np.logical_not(_equal(a, b)),
 }
 DRAWN_RULES: dict[np.ufunc, Callable[..., Any]] = RULES | {
-    np.absolute: lambda a: -a if a < 0 else a,
     np.maximum: lambda a, b: b if a < b else a,
     np.minimum: lambda a, b: a if a < b else b,
     np.divide: lambda a, b: a.linear(1 / b, 0),
     np.floor: lambda a: float(math.floor(a)),
     np.ceil: lambda a: float(math.ceil(a)),
-    np.rint: lambda a: a.rint(),
     np.floor_divide: lambda a, b: float(math.floor(a / b)),
-    np.remainder: lambda a, b: a - b * math.floor(a / b),
 }
 
 
@@ -178,7 +175,7 @@ class Drawn(Symbol):
         return int(self.at(0.5) // 1)
 
     def __ceil__(self) -> int:
-        return -(-self).__floor__()
+        return -int((-self).__floor__())
 
     def __trunc__(self) -> int:
         return math.ceil(self) if self < 0 else math.floor(self)
