@@ -58,8 +58,14 @@ def refutation(
                 if state is None or model.initial[state] == 0:
                     return f"the environment starts in a state ({observation}) that is no start"
             action = int(rng.integers(len(actions)))
+            at = f"state {state}, action {action}"
             if mask is not None and not mask[state, action]:
-                action = int(rng.choice(np.flatnonzero(mask[state])))
+                try:
+                    env.step(actions[action])
+                except Exception:  # noqa: BLE001 (as the model says)
+                    state = None
+                    continue
+                return f"{at}: the environment allows it"
             result, time = env.step(actions[action]), time + 1
             following = None if result[2] else state_of(result[0], time)
             if not _count(model, (state, action), following, result, counts):
@@ -67,8 +73,7 @@ def refutation(
                     "the end" if result[2] else "such a state" if following is None else following
                 )
                 step = f"step to {made} with the reward {float(result[1]):g}"
-                where = f"state {state}, action {action}"
-                return f"{where}: the model has no {step}, the environment made one"
+                return f"{at}: the model has no {step}, the environment made one"
             state = None if result[2] or result[3] else following
         return _unlikely(counts)
     finally:
