@@ -1,5 +1,6 @@
 """The models that `model_of` finds, against published models and figures known by other means."""
 
+import random
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -150,7 +151,8 @@ class TicTacToe(gym.Env):
 
     def put(self, square: int, player: int) -> bool:
         self.board[square] = player
-        return any(all(self.board[i] == player for i in line) for line in self.LINES)
+        board = self.board.tolist()
+        return any(board[i] == board[j] == board[k] == player for i, j, k in self.LINES)
 
     def step(self, action: int) -> Any:
         if self.board[action]:
@@ -219,6 +221,8 @@ DRAWS: dict[str, tuple[Callable[[Any], Any], float]] = {
     "two of four": (lambda rng: sum(rng.choice(4, 2, replace=False)), 3.0),
     "two dice": (lambda rng: float(sum(rng.integers(1, 7) for _ in range(2)) == 7), 1 / 6),
     "until a six": (lambda rng: float(any(rng.integers(6) == 5 for _ in iter(int, 1))), 1.0),
+    "Python's choice": (lambda rng: random.choice([1.0, 1.0, 4.0]), 2.0),  # noqa: S311
+    "the global generator": (lambda rng: np.random.randint(1, 3), 1.5),  # noqa: NPY002
     "shuffled": (lambda rng: float(rng.permutation(4)[0]), 1.5),
 }
 

@@ -81,11 +81,16 @@ def model_of(
     try:
         state.restore_original(without_transparent=True)
         state.play(actions)
-        held = parts_of([vars(layer) for layer in state.layers]).values()
-        with scripted(state.script, [*held, *(sys.modules[name] for name in modules)]):
+        held = list(parts_of([vars(layer) for layer in state.layers]).values())
+        held += [sys.modules[name] for name in modules]
+        for layer in state.layers:
+            layer.action_space.np_random  # noqa: B018 (makes its generator)
+            held.append(layer.action_space)
+        with scripted(state.script, held):
             model, mask = search.run()
         state.restore_original(without_transparent=True)
-        if problem := refutation(state.layers[0], model, search.state_now, actions, mask):
+        allowed = None if mask.all() else mask
+        if problem := refutation(state.layers[0], model, search.state_now, actions, allowed):
             raise NotFinite(f"{OUTSIDE}: {problem}")
     except Stop as stop:
         raise NotFinite(str(stop)) from None
@@ -101,7 +106,6 @@ def model_of(
     for error, pairs in search.illegal.items():
         notes.append(f"{pairs:,} pairs of state and action are not allowed: {error}")
     observations, spent = search.observations * search.times, perf_counter() - search.started
-    allowed = None if mask.all() else mask
     return FoundModel(model, allowed, observations, actions, search.horizon, notes, spent)
 
 

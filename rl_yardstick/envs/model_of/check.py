@@ -19,6 +19,7 @@ from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 STEPS = 20_000
 MOST_DEVIATIONS = 6.0
+LEGAL = 0.95  # share of steps for which an action is chosen that is allowed
 FEWEST = 9.0  # a variance below which counts are far from normally distributed
 
 # Of each state and action: {(next state, -1 at the end; reward, None if random): [chance, count]}.
@@ -58,6 +59,8 @@ def refutation(
                 if state is None or model.initial[state] == 0:
                     return f"the environment starts in a state ({observation}) that is no start"
             action = int(rng.integers(len(actions)))
+            if mask is not None and rng.random() < LEGAL:
+                action = int(rng.choice(np.flatnonzero(mask[state])))
             at = f"state {state}, action {action}"
             if mask is not None and not mask[state, action]:
                 try:

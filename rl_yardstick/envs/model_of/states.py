@@ -17,7 +17,7 @@ import io
 import pickle
 import types
 from collections import deque
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Hashable, Iterable
 from typing import Any
 
 import gymnasium as gym
@@ -111,8 +111,9 @@ class State:
             ((i, name), value)
             for i, layer in enumerate(self.layers)
             for name, value in vars(layer).items()
-            if name not in self.no_state and (i, name) not in self.hidden
-            if not isinstance(value, GENERATORS)
+            if name not in self.no_state
+            and (i, name) not in self.hidden
+            and (type(value) in ATOMS or not isinstance(value, GENERATORS))
         ]
 
     def play(self, actions: list[Any], episodes: int = 2, steps: int = 50) -> None:
@@ -279,7 +280,7 @@ class State:
             parts = value.items()
         elif kind is not list:
             try:
-                parts = [list(x) if isinstance(x, Iterator) else x for x in value.__reduce_ex__(4)]
+                parts = [list(x) if hasattr(x, "__next__") else x for x in value.__reduce_ex__(4)]
             except Exception:  # noqa: BLE001 (classes decide what they raise)
                 return "object", i
             seen[-len(seen)] = 0, parts  # their ids are not used again while these live
