@@ -1,0 +1,337 @@
+"""All states, and the outcomes of each action in each of them.
+
+The draws of a step form a tree; `Tree` adds up the probabilities of its leaves. A loop that draws
+until it likes the result comes back to the same place in the code. If what can follow the second
+visit equals what can follow the first, the tree is cut there, and the probability of coming back is
+shared out among the other outcomes, which is exact.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rl_yardstick.envs.model_of.draws import NEVER, Again, Script, Suspect, take_step
+from rl_yardstick.envs.model_of.states import Refuted, Saved, State
+from rl_yardstick.envs.model_of.symbols import Drawn, Stop
+from rl_yardstick.mdp.transition_model import Bools, TransitionModel
+
+MOST_ENTRIES = 100_000_000  # of the arrays of a model
+MOST_SPANS = 1000  # times at which one action can do different things, if episodes have no end
+LEVELS = (1e-6, 0.1, 0.3, 0.5, 0.7, 0.9, 1 - 1e-6)
+
+KEPT = "`{}` is kept over `reset` (ignore it if it changes nothing)"
+
+
+class Outcome(NamedTuple):
+    """What a run came to; ``state`` is the number of the next state, -1 where the episode ended."""
+
+    state: int
+    reward: float
+    variance: float = 0.0
+    terminated: bool = False
+    truncated: bool = False
+
+
+Chances = dict[Any, float]  # of outcomes
+Spans = list[tuple[int, Chances]]  # what an action does from a time on, until the next entry
+Run = Callable[[list[int], int, dict[Any, bool]], Outcome]
+
+
+class Tree:
+    """The tree of draws below one action in one state."""
+
+    def __init__(self, run: Run, script: Script) -> None:
+        self.run, self.script = run, script
+        self.loops: dict[Any, bool] = {}
+
+    def outcomes(self) -> Chances:
+        """The probability of each outcome."""
+        while True:
+            try:
+                chances, returned = self._below([], 0, [])
+            except Suspect as suspect:
+                self._judge(*suspect.args)
+            else:
+                rest = 1 - returned.get(-1, 0.0)
+                return {outcome: p / rest for outcome, p in chances.items()}
+
+    def _below(
+        self, choices: list[int], root: int, back: list[list[int]], leaf: Any = None
+    ) -> tuple[Chances, Chances]:
+        """The chances of the outcomes below these choices, and of coming back to each node above.
+
+        ``back`` collects the runs that came back; ``leaf`` is a run that began with the choices.
+        """
+        outcome, node, trace = leaf = leaf or self._leaf(choices, root)
+        depth = len(choices)
+        if len(trace) == depth:
+            if outcome is not None:
+                return {outcome: 1.0}, {}
+            back += [choices] if node >= 0 else []
+            return {}, {node: 1.0}
+        chosen, shares = trace[depth]
+        total: Chances = {}
+        returned: Chances = {}
+        for choice, p in enumerate(shares):
+            if p > 0:
+                known = leaf if choice == chosen else None
+                below = self._below([*choices, choice], root, back, known)
+                for whole, part in zip((total, returned), below, strict=True):
+                    for key, share in part.items():
+                        whole[key] = whole.get(key, 0.0) + p * share
+        mine = returned.pop(depth, 0.0)
+        if mine > 1 - 1e-12:
+            raise Stop("a loop draws again and again, and never ends")
+        if mine:
+            total, returned = ({k: p / (1 - mine) for k, p in x.items()} for x in (total, returned))
+        return total, returned
+
+    def _leaf(self, choices: list[int], root: int) -> Any:
+        """One run: its outcome, or the node that it came back to, and its trace."""
+        try:
+            return self.run(choices, root, self.loops), -1, self.script.trace
+        except Again as again:
+            return None, again.args[0], self.script.trace
+
+    def _judge(self, place: Any, first: int, choices: list[int]) -> None:
+        """Whether a second visit starts again from the first: then the same must follow both."""
+        self.loops[place] = True
+        back: list[list[int]] = []
+        try:
+            one, _ = self._below(choices[:first], first, back)
+            for path in back[:3]:
+                other, _ = self._below(path, len(path), [])
+                close = one.keys() == other.keys()
+                if not close or any(abs(one[key] - other[key]) > 1e-9 for key in one):
+                    self.loops[place] = False
+            self.loops[place] &= bool(one)
+        except Stop:
+            self.loops[place] = False
+        except Suspect as inner:  # is judged first
+            del self.loops[place]
+            self._judge(*inner.args)
+
+
+@dataclass
+class Search:
+    """Finds all states of an environment, and the outcomes of all actions."""
+
+    state: State
+    actions: list[Any]
+    seconds: float
+    max_states: int
+    progress: Callable[[int, int], None] | None = None
+    started: float = field(default_factory=perf_counter)
+
+    def run(self) -> tuple[TransitionModel, Bools]:
+        """The model and the allowed actions, once no guess about the state proves wrong."""
+        while True:
+            self.state.guess()
+            try:
+                self._search()
+                self.state.check_constants()
+                self._check_reset()
+                return self._model()
+            except Refuted as refuted:
+                self.state.used.add(refuted.args[0])
+
+    def _search(self) -> None:
+        self.index: dict[Hashable, int] = {}
+        self.saved: list[bytes] = []
+        self.observations: list[Any] = []
+        self.rows: list[list[Spans]] = []
+        self.illegal: dict[str, int] = {}
+        self.end = NEVER  # the time of the last step of the longest episode
+        self.runs, self.check_every = 0, 256
+        start = self.state.save(self.state.variables())
+        self.state.script.time = 0
+        self.initial = self._outcomes(start, None)
+        while len(self.rows) < len(self.saved):
+            state = len(self.rows)
+            self.rows.append([self._spans(state, action) for action in self.actions])
+            if not any(self.rows[-1]):
+                raise Stop(f"every action fails in a state: {next(iter(self.illegal))}")
+            lengths = [len(spans) > 3 for row in self.rows for spans in row] if state == 20 else []
+            if sum(lengths) > len(lengths) / 2:  # time matters all along
+                raise Refuted(next(iter(self.state.clocks)))
+
+    def _check_reset(self) -> None:
+        """A reset must lead to the same states from everywhere."""
+        for outcome in self._outcomes(self.saved[-1], None):
+            if outcome not in self.initial:
+                self._refuse_start(self.state.saved(self.saved[outcome.state]))
+
+    def _refuse_start(self, variables: Saved) -> None:
+        """Name the attribute that no start of an episode has."""
+        starts = [self.state.saved(self.saved[outcome.state]) for outcome in self.initial]
+        for place, value in variables.items():
+            known = {self.state.by_value(start.get(place)) for start in starts}
+            if self.state.by_value(value) not in known:
+                raise Stop(KEPT.format(place[1]))
+
+    def _spans(self, state: int, action: Any) -> Spans:
+        """What the action does at each time; empty where it is not allowed."""
+        spans: Spans = []
+        self.state.script.time = 0
+        while self.state.script.time <= self.end and self.state.script.time < NEVER:
+            time, self.state.script.until = self.state.script.time, NEVER
+            try:
+                chances = self._outcomes(self.saved[state], action)
+            except Exception as error:
+                message = f"{type(error).__name__}: {error}"
+                if self.state.script.visits:  # no rule of the game: those come before the draws
+                    raise Stop(f"{message}, after a random draw") from error
+                self.illegal[message] = self.illegal.get(message, 0) + 1
+                return []
+            spans.append((time, chances))
+            if all(outcome.state < 0 for outcome in chances):
+                if time and any(outcome.truncated for outcome in chances):
+                    self.end = min(self.end, time)
+            elif time == self.end or (len(spans) > MOST_SPANS and self.end == NEVER):
+                raise Refuted(next(iter(self.state.clocks)))
+            self.state.script.time = self.state.script.until + 1
+        return spans
+
+    def _outcomes(self, saved: bytes, action: Any) -> Chances:
+        def run(choices: list[int], root: int, loops: dict[Any, bool]) -> Outcome:
+            self.state.script.begin(choices, root, loops)
+            outcome = self._step(saved, action)
+            return self._linear(outcome, saved, action) if self.state.script.floats else outcome
+
+        return Tree(run, self.state.script).outcomes()
+
+    def _step(self, saved: bytes, action: Any) -> Outcome:
+        """The outcome of one run under the script; a new state gets the next number."""
+        self._tick()
+        self.state.restore(saved)
+        result = take_step(self.state.layers[0], action)
+        observation, reward, *ends = result[:4] if action is not None else (result[0], 0.0, 0, 0)
+        reward = reward.item() if isinstance(reward, np.ndarray) else reward
+        moments = reward.moments() if isinstance(reward, Drawn) else (float(reward), 0.0)
+        if any(ends):
+            self.state.variables()
+            return Outcome(-1, *moments, *map(bool, ends))
+        self.state.check_clocks(is_reset=action is None)
+        variables = self.state.variables()
+        key = self.state.key(variables), self.state.by_value(observation)
+        if key not in self.index:
+            if len(self.saved) >= self.max_states:
+                raise Stop(f"more than {self.max_states:,} states{self._growing()}")
+            self.saved.append(self.state.save(variables))
+            self.observations.append(copy.deepcopy(observation))
+        return Outcome(self.index.setdefault(key, len(self.index)), *moments)
+
+    def _linear(self, outcome: Outcome, saved: bytes, action: Any) -> Outcome:
+        """The outcome of a run that made a float of a continuous number.
+
+        Only the reward may depend on it, and linearly: then its mean and variance are known.
+        """
+        number = self.state.script.floats[0]
+        plain = Drawn(self.state.script, list(number.known))
+        choices, points = [choice for choice, _ in self.state.script.trace], []
+        for level in LEVELS:
+            self.state.script.begin(choices, len(choices), {})
+            self.state.script.level = level
+            other = self._step(saved, action)
+            points.append((plain.at(level), other.reward))
+            (x0, y0), (x, y) = points[0], points[-1]
+            if len(points) == 2:
+                slope = (y - y0) / (x - x0)
+            far = level > LEVELS[1] and abs(y0 + slope * (x - x0) - y) > 1e-9 * max(1.0, abs(y))
+            same = other._replace(reward=outcome.reward) == outcome
+            if far or not same or len(self.state.script.floats) > 1:
+                number.now()
+        mean, variance = plain.linear(slope, y0 - slope * x0).moments()
+        return outcome._replace(reward=mean, variance=variance)
+
+    def _tick(self) -> None:
+        """Watch the time, and now and then the constants."""
+        self.runs += 1
+        spent = perf_counter() - self.started
+        if spent > self.seconds:
+            done = f"{len(self.saved):,} states found, {len(self.rows):,} of them done"
+            if not self.rows:
+                done = f"`reset` has more than {len(self.saved):,} outcomes"
+            raise Stop(f"no end after {spent:.0f} seconds: {done}{self._growing()}")
+        if self.runs % self.check_every == 0:
+            self.state.check_constants()
+            if perf_counter() - self.started - spent > 0.05 * spent * self.check_every / self.runs:
+                self.check_every *= 2
+            if self.progress is not None:
+                self.progress(len(self.saved), len(self.rows))
+
+    def _growing(self) -> str:
+        """The attribute that takes most values, as a hint."""
+        values: dict[str, set[Hashable]] = {}
+        sample = self.saved[:: max(1, len(self.saved) // 500)]
+        for saved in sample:
+            for (_, name), value in self.state.saved(saved).items():
+                values.setdefault(name, set()).add(self.state.by_value(value))
+        name = max(values, key=lambda name: len(values[name]), default="")
+        return f"; `{name}` has {len(values[name])} values in {len(sample)} of them" if name else ""
+
+    def state_now(self, observation: Any, time: int) -> int | None:
+        """The number in the model of the state that the environment is in; None if unknown."""
+        try:
+            variables = self.state.variables()
+        except Refuted as refuted:
+            raise Stop(KEPT.format(refuted.args[0][1])) from None
+        key = self.state.key(variables), self.state.by_value(observation)
+        if time == 0 and key not in self.index:
+            self._refuse_start(variables)
+        state = self.index.get(key)
+        return None if state is None else min(time, self.times - 1) * len(self.rows) + state
+
+    @property
+    def horizon(self) -> int | None:
+        """The steps of the longest episode, where the environment itself counts them."""
+        return self.end + 1 if self.state.clocks and self.end < NEVER else None
+
+    def _count_times(self) -> int:
+        """At how many times the states of the model are told apart; 1 if time changes nothing."""
+        for (_, usual), *later in (spans for row in self.rows for spans in row if spans):
+            if any(first < self.end or not _alike(usual, chances) for first, chances in later):
+                if self.end == NEVER:
+                    raise Refuted(next(iter(self.state.clocks)))
+                return self.end + 1
+        return 1
+
+    def _model(self) -> tuple[TransitionModel, Bools]:
+        """The model, whose state at time t has the number t * states + state, and its mask."""
+        n, times = len(self.rows), self._count_times()
+        self.times = times
+        most = max(len(chances) for row in self.rows for spans in row for _, chances in spans)
+        shape = times, n, len(self.actions), most
+        if 5 * np.prod(shape, dtype=float) > MOST_ENTRIES:
+            raise Stop(f"a model of {n:,} states at {times:,} times, {most} outcomes is too large")
+        table = np.zeros((5, *shape))  # probability, reward, variance, end, next state
+        table[0, ..., 0] = table[3] = 1.0  # of actions that are not allowed
+        for s, actions in enumerate(self.rows):
+            for a, spans in enumerate(actions):
+                for first, chances in spans:
+                    row = [(p, *o[1:3], o.state < 0, max(o.state, 0)) for o, p in chances.items()]
+                    table[:, first:, s, a] = 0.0
+                    table[:, first:, s, a, : len(row)] = np.transpose(row)[:, None]
+        table[0] /= table[0].sum(axis=3, keepdims=True)
+        table[4] += n * np.minimum(np.arange(times) + 1, times - 1)[:, None, None, None]
+        prob, reward, variance, ends, following = table.reshape(5, times * n, *shape[2:])
+        initial = np.zeros(times * n)
+        for outcome, p in self.initial.items():
+            initial[outcome.state] = p / sum(self.initial.values())
+        noise = variance if variance.any() else None
+        model = TransitionModel(
+            prob, following.astype(np.int64), reward, ends.astype(np.bool_), initial, noise
+        )
+        return model, np.tile([[bool(spans) for spans in row] for row in self.rows], (times, 1))
+
+
+def _alike(one: Chances, other: Chances) -> bool:
+    """Whether both earn the same rewards and end as often, whatever else they do."""
+    a, b = (sum(p * np.array([o.reward, o.terminated]) for o, p in x.items()) for x in (one, other))
+    return bool(np.allclose(a, b, rtol=1e-12, atol=1e-12))

@@ -1,0 +1,211 @@
+"""Numbers without a value: continuous draws, and what stands in for watched attributes.
+
+A continuous number is known by its distribution only. Comparing or rounding it branches with the
+exact probability of each side, and narrows what is known of it: ``u < 0.3``, ``int(6 * u)``,
+``searchsorted(cdf, u)`` and ``round(normal)`` have as many outcomes as they can show.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+TAIL = 1e-15  # of a distribution, left out
+NOT_OF_AN_ENVIRONMENT = (str(Path(__file__).parent), np.__path__[0])
+
+
+class Stop(BaseException):
+    """No model can be found; passes through an environment's own ``except Exception``."""
+
+
+def where() -> str:
+    """The file and line of the environment that is running, as ``env.py:110``."""
+    frame = sys._getframe(1)
+    while frame.f_back and frame.f_code.co_filename.startswith(NOT_OF_AN_ENVIRONMENT):
+        frame = frame.f_back
+    return f"{frame.f_code.co_filename.rpartition('/')[2]}:{frame.f_lineno}"
+
+
+class Symbol(NDArrayOperatorsMixin):
+    """The number ``scale * x + shift``; numbers made from one draw share what is known of x.
+
+    Every operator and NumPy function of it comes to `__array_ufunc__`. A subclass has ``now()``, a
+    value or a refusal, and ``below(cut, closed)``: whether x < cut, or x <= cut if closed.
+    """
+
+    now: Callable[[], Any]
+    below: Callable[[Any, bool], Any]
+
+    def __init__(self, script: Any, known: Any, scale: float = 1, shift: Any = 0) -> None:
+        self.script, self.known, self.scale, self.shift = script, known, scale, shift
+
+    def linear(self, scale: float, shift: Any) -> Self:
+        """``scale`` times this number plus ``shift``."""
+        return type(self)(self.script, self.known, self.scale * scale, self.shift * scale + shift)
+
+    def is_negative(self, or_zero: bool) -> Any:
+        """Whether it is below zero, or at most zero; an array if the shift is one."""
+        if self.scale == 0:
+            return self.shift <= 0 if or_zero else self.shift < 0
+        is_below = self.below(-self.shift / self.scale, or_zero == (self.scale > 0))
+        return is_below if self.scale > 0 else np.logical_not(is_below)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **keywords: Any) -> Any:
+        if isinstance(keywords.get("out", (None,))[0], Symbol):
+            del keywords["out"]  # `x += 1` makes a new number
+        rule = (DRAWN_RULES if isinstance(self, Drawn) else RULES).get(ufunc)
+        if rule is None or method != "__call__" or keywords:
+            inputs = tuple(x.now() if isinstance(x, Symbol) else x for x in inputs)
+            result = getattr(ufunc, method)(*inputs, **keywords)
+        else:
+            result = rule(*(x.item() if isinstance(x, np.generic) else x for x in inputs))
+        return result.item() if isinstance(result, np.generic) else result
+
+    def __bool__(self) -> bool:
+        return bool(self != 0)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return self.now().__reduce_ex__(protocol)
+
+
+def _value_method(name: str) -> Callable[..., Any]:
+    return lambda self, *given: getattr(self.now(), name)(*given)
+
+
+for _name in ["int", "float", "index", "hash", "str", "format", "round", "floor", "ceil", "trunc"]:
+    setattr(Symbol, f"__{_name}__", _value_method(f"__{_name}__"))
+
+
+def _add(a: Any, b: Any, sign: int = 1) -> Any:
+    if not isinstance(b, Symbol):
+        return a.linear(1, sign * b)
+    if not isinstance(a, Symbol):
+        return b.linear(sign, a)
+    if a.known is b.known:
+        return type(a)(a.script, a.known, a.scale + sign * b.scale, a.shift + sign * b.shift)
+    return a + sign * b.now() if isinstance(a, Drawn) else a.now() + sign * b
+
+
+def _multiply(a: Any, b: Any) -> Any:
+    a, b = (a, b) if isinstance(a, Symbol) else (b, a)
+    if isinstance(b, Symbol) or np.ndim(b):
+        return a.now() * b
+    return a.linear(b, 0) if b else 0 * b
+
+
+def _less(a: Any, b: Any, or_equal: bool = False) -> Any:
+    difference = _add(a, b, -1)
+    if isinstance(difference, Symbol):
+        return difference.is_negative(or_equal)
+    return difference <= 0 if or_equal else difference < 0
+
+
+def _equal(a: Any, b: Any) -> Any:
+    return np.logical_not(_less(a, b)) & _less(a, b, or_equal=True)
+
+
+RULES: dict[np.ufunc, Callable[..., Any]] = {
+    np.add: _add,
+    np.subtract: lambda a, b: _add(a, b, -1),
+    np.multiply: _multiply,
+    np.negative: lambda a: a.linear(-1, 0),
+    np.less: _less,
+    np.less_equal: lambda a, b: _less(a, b, or_equal=True),
+    np.greater: lambda a, b: _less(b, a),
+    np.greater_equal: lambda a, b: _less(b, a, or_equal=True),
+    np.equal: _equal,
+    np.not_equal: lambda a, b: np.logical_not(_equal(a, b)),
+}
+DRAWN_RULES: dict[np.ufunc, Callable[..., Any]] = RULES | {
+    np.maximum: lambda a, b: b if a < b else a,
+    np.minimum: lambda a, b: a if a < b else b,
+    np.divide: lambda a, b: a.linear(1 / b, 0),
+    np.floor: lambda a: float(math.floor(a)),
+    np.ceil: lambda a: float(math.ceil(a)),
+    np.floor_divide: lambda a, b: float(math.floor(a / b)),
+}
+
+
+class Law(NamedTuple):
+    """A continuous distribution."""
+
+    cdf: Callable[[float], float]
+    quantile: Callable[[float], float]
+    mean: float
+    variance: float
+
+
+UNIFORM = Law(lambda x: min(max(x, 0.0), 1.0), lambda q: q, 0.5, 1 / 12)
+NORMAL = Law(NormalDist().cdf, NormalDist().inv_cdf, 0.0, 1.0)
+
+
+class Drawn(Symbol):
+    """A continuous number; known are its law, two quantiles around it, and where it was drawn."""
+
+    def _split(self, at: list[float]) -> None:
+        """Branch over the intervals between these quantiles, and narrow what is known."""
+        low, high = self.known[1:3]
+        bounds = [low, *sorted({q for q in at if low < q < high}), high]
+        interval = self.script.branch([b - a for a, b in pairwise(bounds)])
+        self.known[1:3] = bounds[interval : interval + 2]
+
+    def below(self, cut: Any, closed: bool) -> Any:
+        at = [self.known[0].cdf(x) for x in np.ravel(cut).tolist()]
+        self._split(at)
+        return (np.array(at) > self.known[1]).reshape(np.shape(cut))[()]
+
+    def at(self, quantile: float) -> float:
+        """Its value at a quantile of what is known."""
+        law, low, high, _ = self.known
+        q = min(max(low + quantile * (high - low), TAIL), 1 - TAIL)
+        return float(self.scale * law.quantile(q) + self.shift)
+
+    def __floor__(self) -> int:
+        first, last = (math.floor(end) for end in sorted((self.at(0.0), self.at(1.0))))
+        whole = range(first, last + 1) if last - first < 1e6 else self.now()
+        self._split([self.known[0].cdf((i - self.shift) / self.scale) for i in whole])
+        return int(self.at(0.5) // 1)
+
+    def __ceil__(self) -> int:
+        return -int((-self).__floor__())
+
+    def __trunc__(self) -> int:
+        return math.ceil(self) if self < 0 else math.floor(self)
+
+    __int__ = __trunc__
+
+    def __round__(self, digits: int | None = None) -> Any:
+        power = 10.0 ** (digits or 0)
+        whole = math.floor(self * power + 0.5)
+        return whole if digits is None else whole / power
+
+    def rint(self) -> float:
+        """To the nearest whole number; `numpy.round` calls it."""
+        return float(round(self))
+
+    def now(self) -> Any:
+        raise Stop(f"{self.known[3]} draws a continuous number, which reaches the state")
+
+    def __float__(self) -> float:
+        # The reward may depend on it linearly: see `search`.
+        self.script.floats.append(self)
+        return self.at(self.script.level)
+
+    def moments(self) -> tuple[float, float]:
+        """Its mean and variance."""
+        law, low, high, place = self.known
+        if law is UNIFORM:
+            mean, variance = (low + high) / 2, (high - low) ** 2 / 12
+        elif (low, high) == (0.0, 1.0):
+            mean, variance = law.mean, law.variance
+        else:
+            raise Stop(f"{place} draws a continuous reward that is cut off at a bound")
+        return self.scale * mean + self.shift, self.scale**2 * variance
