@@ -242,7 +242,7 @@ def optimum(env: Any, **env_kwargs: Any) -> Told:
     entry = with_files_read(env_id, {"env_kwargs": kwargs | env_kwargs})
     spec = validated({"algo": "optimal", "env_id": env_id, **entry})
     if (known := exact_evaluator(spec)) is None:
-        raise UserError(model_refusal(spec) or f"the model of {env_id} is not known")
+        raise UserError(model_refusal(spec, False) or f"the model of {env_id} is not known")
     scale, (values, actions) = known.yardstick, known.optimum
     figures = {"optimum": scale.optimum, "baseline": scale.baseline, "horizon": known.horizon}
     lines = [f"{key:<14}{value:,.6g}" for key, value in figures.items()]

@@ -202,6 +202,11 @@ def folder_name(text: str) -> str:
     return text
 
 
+def model_limit(text: str) -> str:
+    """``auto``, ``none``, or the most states of a model."""
+    return text if text in {"auto", "none"} else str(whole_number(1)(text))
+
+
 COUNT = whole_number(1)
 BUDGET = whole_number(1, besides={-1: "as in the hyperparameters"})  # as in rl_zoo3
 INTERVAL = whole_number(-LARGEST)  # below 1 for never, as in rl_zoo3
@@ -246,6 +251,14 @@ _SHARED: Sequence[Flag] = (
         metavar="WHERE",
     ),
     flag("--run-timeout", "end a run after this time, e.g. 10m", seconds, metavar="TIME"),
+    flag(
+        "--model",
+        "where none is published, find the environment's exact model in its code: auto (at most "
+        "10 s and 100,000 states), none, or the most states",
+        model_limit,
+        "auto",
+        dest="exact_model",
+    ),
     flag("--json", "also write the result to this file", Path, metavar="FILE"),
     switch(
         "--diagnose",
@@ -276,6 +289,10 @@ def import_typed(args: argparse.Namespace) -> None:
         names = [split_id(word)[1] if key == "env" else agent_name(word) for word in words]
         setattr(args, key, names if isinstance(given, list) else names[0])
     import_modules(args.gym_packages)
+    if "exact_model" in args:
+        from rl_yardstick.envs import found_models
+
+        found_models.limit(args.exact_model or "auto")
 
 
 def check_alone(

@@ -80,6 +80,7 @@ FLAGS: Flags = {
         flag("--name", "name of the study's folder", cli.folder_name, metavar="NAME"),
         flag("-f --log-folder", "folder of all studies", default="logs/studies"),
         switch("-tb --tensorboard", "write a TensorBoard log of each run"),
+        *shared("--model", default=None),
         *shared("--diagnose", default=None),
         switch("--watch-learning", "pages that play how agents learn", dest="learning_pages"),
         flag("--figures", "formats (default: png svg)", nargs="+", choices=("png", "svg", "pdf")),

@@ -35,7 +35,7 @@ def build_parser() -> OneLineParser:
     own = (
         flag("--test", tested, nargs="*", action="append", metavar="KEY:VALUE"),
         flag("--map", "draw the cost of each cell, as .png", Path, metavar="FILE"),
-        *shared("--jobs", "--json"),
+        *shared("--model", "--jobs", "--json"),
     )
     words = "Show where an agent loses return against the optimum, exactly."
     parser = OneLineParser(words, EPILOG, {"": MODEL_FLAGS, "explaining": own})
@@ -91,7 +91,7 @@ def asked(console: Console, wanted: Wanted) -> Asked:
         spec = found.spec
         evaluator = exact_evaluator(spec)
         if evaluator is None:
-            reason = model_refusal(spec) or f"the model of {spec.env_id} is not known"
+            reason = model_refusal(spec, False) or f"the model of {spec.env_id} is not known"
             raise UserError(f"{reason}, so the gap to the optimum cannot be split")
         with closing(playing_env(found, None)) as env:
             return Asked(found, evaluator, load_agent(found, env))

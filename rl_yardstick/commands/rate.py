@@ -42,7 +42,7 @@ def build_parser() -> OneLineParser:
         *shared("--env-kwargs", "--gym-packages"),
         several("--bins", "of observations, as in bins:10 low:[-2,-3] high:[2,3]"),
         flag("--table --csv", "also write the table to this file", Path, metavar="FILE"),
-        *shared("--json"),
+        *shared("--model", "--json"),
     )
     return OneLineParser(words, EPILOG, {"": flags})
 

@@ -115,12 +115,10 @@ def _discount(spec: TrainSpec) -> float:
 
 def _model(spec: TrainSpec, env: gym.Env[Any, Any]) -> TransitionModel:
     """The model of an environment with its wrappers; `UserError` if it is not known."""
-    from rl_yardstick.envs.known_models import model_check, transition_model, unknown_wrapper
+    from rl_yardstick.envs.known_models import model_check, transition_model
 
     if (model := transition_model(env)) is not None:
         return model
-    if (wrapper := unknown_wrapper(env)) is not None:
-        raise UserError(f"the effect of {wrapper} on the model is not known: nothing to compare")
     check = model_check(env)
     reason = None if check is None else check.refusal
     raise UserError(reason or f"the model of {spec.env_id} is not known, so there is no optimum")

@@ -77,7 +77,7 @@ FLAGS: Flags = {
         flag("--log-interval", "episodes or rollouts between log records", cli.LOG_INTERVAL, -1),
         flag("--verbose", "0 silent, 1 (default), 2 the library's tables", cli.VERBOSITY, 1),
         switch("-P --progress", "a progress bar even without a terminal"),
-        *shared("--diagnose"),
+        *shared("--model", "--diagnose"),
         flag("--watch-learning", WATCH, nargs="?", const="", metavar="FILE"),
         flag("--watch-episodes", "first episodes of a table to play on it", WATCHED, 0),
     ),
@@ -173,7 +173,15 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
     cli.check_device(args.device)
     entry, origins = entry_from_flags(args)
     names = ["eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer"]
-    names += ["log_interval", "vec_env", "device", "diagnose", "watch_episodes", "gym_packages"]
+    names += [
+        "exact_model",
+        "log_interval",
+        "vec_env",
+        "device",
+        "diagnose",
+        "watch_episodes",
+        "gym_packages",
+    ]
     spec = settings.read_spec(
         args.algo,
         args.env,

@@ -16,8 +16,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from rl_yardstick.envs.checking import is_changed
 from rl_yardstick.envs.known_models import TRANSPARENT_WRAPPERS, time_limit, transition_model
+from rl_yardstick.envs.published_models import is_changed
 
 DATA = Path(__file__).with_name("brackets.json")
 

@@ -68,13 +68,18 @@ class Bijection:
         except (LookupError, TypeError):
             raise _not_in(self.space, members) from None
 
-    def number(self, member: Any) -> int:
-        """The number of one member; ValueError if it is not in the space."""
-        index, digits = 0, list[Any]()
+    def digits_of(self, member: Any) -> list[Any]:
+        """The digits of one member, not checked; ValueError if there are too many or too few."""
+        digits = list[Any]()
         for value in self._values(member):
             digits += [value] if isinstance(value, int) else np.ravel(value).tolist()
         if len(digits) != len(self._ranges):
             raise _not_in(self.space, member)
+        return digits
+
+    def number(self, member: Any) -> int:
+        """The number of one member; ValueError if it is not in the space."""
+        index, digits = 0, self.digits_of(member)
         for digit, (size, first) in zip(digits, self._ranges, strict=True):
             place = int(digit) - first
             if not 0 <= place < size or digit != place + first:

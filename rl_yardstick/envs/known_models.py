@@ -1,9 +1,8 @@
 """The exact dynamics of a Gymnasium environment, with the effects of its wrappers.
 
-The result is None where the effect of a wrapper is unknown, since a wrong model would make every
-figure computed from it wrong. For the same reason a model that is neither of Gymnasium's own
-classes nor of this project's is compared with `step` before it is accepted, once a process: see
-`envs.checking`.
+A model is the one that the environment brings (see `envs.published_models`), or one that a search
+in its code finds (`envs.found_models`); both are tested against `step`. Known wrappers change a
+model in a known way; around others, the search looks at the environment in its wrappers.
 """
 
 from __future__ import annotations
@@ -20,9 +19,17 @@ from gymnasium.envs.toy_text.taxi import TaxiEnv
 from gymnasium.wrappers import ClipReward
 from numpy.typing import NDArray
 
-from rl_yardstick.envs.checking import Claim, ModelCheck, checked, claim_of, is_trusted
+from rl_yardstick.envs import found_models
 from rl_yardstick.envs.finite_env import FiniteEnv, MaskedFiniteEnv
+from rl_yardstick.envs.found_models import FoundClaim
 from rl_yardstick.envs.grid import GOAL, GridWorld
+from rl_yardstick.envs.published_models import (
+    Claim,
+    ModelCheck,
+    checked,
+    claim_of,
+    is_trusted,
+)
 from rl_yardstick.envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,
@@ -53,7 +60,7 @@ TRANSPARENT_WRAPPERS = frozenset(
 )
 OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation)
 
-Judgement = tuple[Claim | None, ModelCheck | None]
+Judgement = tuple[Claim | FoundClaim | None, ModelCheck | None]
 
 # A cache of judgements of environments, by `id`: set only while these live.
 _looked_at: dict[int, Judgement] = {}
@@ -63,15 +70,12 @@ def transition_model(env: Env) -> TransitionModel | None:
     """The exact dynamics of an environment, with the rewards that its outermost wrapper gives.
 
     The model is known for this project's grid worlds and textbook environments, its bandits with
-    click rates, Gymnasium's FrozenLake, CliffWalking, Taxi and Blackjack, and environments that
-    hold ``P`` and ``initial_state_distrib`` as toy_text's do and pass
-    `envs.checking.check_transition_model`. Known wrappers are those that leave the dynamics alone,
-    `ScaleReward`, Gymnasium's `ClipReward` (unless rewards are random), and `TerminationReward`
-    where it gives its reward at terminations only. A time limit is no part of the model: see
-    `time_limit`. None where the model is not known.
+    click rates, Gymnasium's FrozenLake, CliffWalking, Taxi and Blackjack, environments that hold
+    ``P`` and ``initial_state_distrib`` as toy_text's do, and those in which a search finds it. A
+    time limit is no part of the model: see `time_limit`. None where the model is not known.
     """
-    _, wrappers = _layers(env)
-    claim = _believed(env)
+    core, wrappers = _layers(env)
+    claim = _believed(core)
     if claim is None:
         return None
     model = claim.model
@@ -93,24 +97,27 @@ def transition_model(env: Env) -> TransitionModel | None:
 
 
 def model_check(env: Env) -> ModelCheck | None:
-    """The result of checking the environment's own model against its `step`.
+    """The result of testing the environment's model against its `step`; None without a model.
 
-    Trusted environments pass without a check. None where there is no model, or wrappers hide it.
+    Trusted environments pass without a test. Where no model was found, it says why.
     """
-    base, wrappers = _layers(env)
-    return _judged(base)[1] if all(map(_folds, wrappers)) else None
+    return _judged(_layers(env)[0])[1]
 
 
-def unknown_wrapper(env: Env) -> str | None:
-    """The innermost wrapper that hides the model, by its class; None where none does."""
-    wrappers = (type(wrapper) for wrapper in _layers(env)[1] if not _folds(wrapper))
-    return next((f"{kind.__module__}.{kind.__qualname__}" for kind in wrappers), None)
+def found_claim(env: Env) -> FoundClaim | None:
+    """What a search has found of an environment; None where the model is not from a search."""
+    claim = _judged(_layers(env)[0])[0]
+    return claim if isinstance(claim, FoundClaim) else None
 
 
 def time_limit(env: Env) -> int | None:
     """The number of steps after which an episode is cut off, None where there is no limit."""
-    _, wrappers = _layers(env)
-    limits = [w._max_episode_steps for w in wrappers if isinstance(w, gym.wrappers.TimeLimit)]
+    limits, inside = list[int](), env
+    while isinstance(inside, gym.Wrapper):
+        limits += [inside._max_episode_steps] if isinstance(inside, gym.wrappers.TimeLimit) else []
+        inside = inside.env
+    if (claim := found_claim(env)) is not None and claim.horizon is not None:
+        limits.append(claim.horizon)
     return min(limits, default=None)
 
 
@@ -122,14 +129,14 @@ def success_outcomes(env: Env) -> Bools | None:
     of FrozenLake and CliffWalking, the passenger delivered in Taxi. In Blackjack it is any win.
     None where the model is not known or no episode terminates.
     """
-    base, claim = env.unwrapped, _believed(env)
+    base, claim = env.unwrapped, _believed(_layers(env)[0])
     if claim is None:
         return None
     model = claim.model
     ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]
     if not ends.any():
         return None
-    if isinstance(base, GridWorld):
+    if isinstance(base, GridWorld) and not isinstance(claim, FoundClaim):
         codes = np.frombuffer(base.map.codes, np.uint8)
         good = codes[model.next_state % base.map.n_cells] == ord(GOAL)
     elif isinstance(base, BlackjackEnv):
@@ -142,9 +149,10 @@ def success_outcomes(env: Env) -> Bools | None:
 
 def observations_of_states(env: Env) -> NDArray[Any] | None:
     """The observation of each state of `transition_model`; None where it is not known."""
-    claim = _believed(env)
+    core, wrappers = _layers(env)
+    claim = _believed(core)
     observations = None if claim is None else claim.observations
-    for wrapper in _layers(env)[1]:
+    for wrapper in wrappers:
         if observations is not None and isinstance(wrapper, OBSERVATION_WRAPPERS):
             observations = wrapper.map_observations(observations)
     return observations
@@ -153,17 +161,18 @@ def observations_of_states(env: Env) -> NDArray[Any] | None:
 def action_masks_of_states(env: Env) -> Bools | None:
     """The action mask of each state of `transition_model`, bool of shape (S, A).
 
-    Known for this project's environments, Gymnasium's Taxi, and `IdleActionMasks`, under the
-    wrappers that `transition_model` knows; None elsewhere.
+    Known for this project's environments, Gymnasium's Taxi, and `IdleActionMasks`, under known
+    wrappers, and where some actions raise an error; None elsewhere.
     """
-    base, wrappers = _layers(env)
-    if not all(map(_folds, wrappers)):
-        return None
+    core, wrappers = _layers(env)
     idle = [wrapper.masks for wrapper in wrappers if isinstance(wrapper, IdleActionMasks)]
     if idle:
         return np.array(idle[-1])
+    if isinstance(claim := _judged(core)[0], FoundClaim):
+        return claim.mask
     # A subclass may have masks of its own.
-    kind: Any = type(base)
+    base: Any = core
+    kind: Any = type(core)
     if isinstance(base, GridWorld) and not base.is_stationary:
         return None
     own = GridWorld.action_masks, MaskedFiniteEnv.action_masks
@@ -175,12 +184,15 @@ def action_masks_of_states(env: Env) -> Bools | None:
 
 
 def _layers(env: Env) -> tuple[Env, list[Wrapper]]:
-    """The environment without its wrappers, and the wrappers, the innermost first."""
+    """The environment up to its outermost unknown wrapper; and those around, innermost first."""
     wrappers = []
     while isinstance(env, gym.Wrapper):
         wrappers.append(env)
         env = env.env
-    return env, wrappers[::-1]
+    wrappers.reverse()
+    unknown = [place for place, wrapper in enumerate(wrappers, 1) if not _folds(wrapper)]
+    n_inside = max(unknown, default=0)
+    return wrappers[n_inside - 1] if n_inside else env, wrappers[n_inside:]
 
 
 def _folds(wrapper: Wrapper) -> bool:
@@ -197,39 +209,48 @@ def _folds(wrapper: Wrapper) -> bool:
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
 
 
-def _believed(env: Env) -> Claim | None:
-    """The environment's claim about its dynamics, if it is accepted and no wrapper hides it."""
-    base, wrappers = _layers(env)
-    if not all(map(_folds, wrappers)):
-        return None
-    claim, check = _judged(base)
+def _believed(core: Env) -> Claim | FoundClaim | None:
+    """What is known of an environment's dynamics, if it stands the test."""
+    claim, check = _judged(core)
     return claim if check is not None and check.refusal is None else None
 
 
 @contextmanager
 def one_look(env: Env) -> Iterator[None]:
     """Cache the model of ``env``, which must not change within the ``with`` statement."""
-    base = env.unwrapped
-    _looked_at[id(base)] = _judged(base)
+    core = _layers(env)[0]
+    _looked_at[id(core)] = _judged(core)
     try:
         yield
     finally:
-        _looked_at.pop(id(base), None)
+        _looked_at.pop(id(core), None)
 
 
-def _judged(base: Env) -> Judgement:
-    """The environment's claim about its dynamics, and the result of its check."""
-    if id(base) in _looked_at:
-        return _looked_at[id(base)]
+def _judged(core: Env) -> Judgement:
+    """What is known of an environment's dynamics, and the result of its test."""
+    if id(core) in _looked_at:
+        return _looked_at[id(core)]
+    if isinstance(core, gym.Wrapper):
+        return _searched(core)
     try:
-        claim = claim_of(base)
+        claim = claim_of(core)
     except ValueError as error:
         return None, ModelCheck(str(error))
     if claim is None:
-        return None, None
-    if not is_trusted(base):
+        return _searched(core)
+    if not is_trusted(core):
         return claim, checked(claim)
     # Blackjack draws cards, and random rewards have only their means in the model.
-    draws = isinstance(base, FiniteEnv) and claim.model.reward_variance is not None
-    plays = not draws and not isinstance(base, BlackjackEnv)
+    draws = isinstance(core, FiniteEnv) and claim.model.reward_variance is not None
+    plays = not draws and not isinstance(core, BlackjackEnv)
     return claim, ModelCheck(None, bit_for_bit=plays, state_can_be_set=plays)
+
+
+def _searched(core: Env) -> Judgement:
+    """What a search finds of an environment's dynamics."""
+    found = found_models.found(core)
+    if found is None:
+        return None, None
+    if isinstance(found, FoundClaim):
+        return found, ModelCheck(None)
+    return None, ModelCheck(found.reason, is_surprising=found.ends_at_limit)

@@ -222,6 +222,7 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
         final_episodes=FINAL_EPISODES,
         gym_packages=list(study.gym_packages),
         diagnose=study.diagnose,
+        exact_model=study.exact_model,
     )
     return spec.changed(**_quickened(spec, study.quick)) if study.is_quick else spec
 

@@ -150,6 +150,7 @@ class StudySpec:
     diagnose: bool = False  #: whether evaluations compare values and gradients with exact ones
     learning_pages: bool = False  #: whether the page links to pages that play first trainings
     figures: tuple[str, ...] = ("png", "svg")  #: formats of figures: "png", "svg", "pdf"
+    exact_model: str = "auto"  #: where none is published: see `TrainSpec`
     run_timeout: float | None = None  #: seconds that each run may take; None for no limit
     first_seed: int = 0  #: the first seed; the others follow it
     against: str = ""  #: label of the only agent to compare the others with; empty for all pairs

@@ -20,6 +20,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 import rl_yardstick
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
+from rl_yardstick.envs import found_models
 from rl_yardstick.envs.finite_spaces import describe
 from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.machine_code.compiling import compile_timer
@@ -59,6 +60,7 @@ def train(
         UserError: if something does not fit; a new run without a step leaves no folder.
         Stopped: after a signal; the state and the agent are saved.
     """
+    found_models.limit(spec.exact_model)
     if spec.n_threads > 0:
         th.set_num_threads(spec.n_threads)
     spec = spec if spec.trained_agent is None else begun_with(spec)

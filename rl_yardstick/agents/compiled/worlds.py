@@ -14,7 +14,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from rl_yardstick.agents.compiled.references import next_uniform
-from rl_yardstick.envs.checking import is_trusted
 from rl_yardstick.envs.known_models import (
     model_check,
     observations_of_states,
@@ -23,6 +22,7 @@ from rl_yardstick.envs.known_models import (
     time_limit,
     transition_model,
 )
+from rl_yardstick.envs.published_models import is_trusted
 from rl_yardstick.envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,

@@ -25,7 +25,7 @@ from rl_yardstick.envs.model_of.check import refutation
 from rl_yardstick.envs.model_of.draws import Script, scripted
 from rl_yardstick.envs.model_of.search import Search
 from rl_yardstick.envs.model_of.states import State, parts_of
-from rl_yardstick.envs.model_of.symbols import Stop
+from rl_yardstick.envs.model_of.symbols import Limit, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 MOST_ACTIONS = 5000
@@ -34,6 +34,10 @@ OUTSIDE = "something outside its attributes decides (a class, a global, the time
 
 class NotFinite(Exception):  # noqa: N818 (says what is wrong with the environment)
     """The environment has no finite model, or none that can be found; one line says why."""
+
+
+class Unfinished(NotFinite):
+    """The search ended at its limits."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,8 @@ def model_of(
         if problem := refutation(state.layers[0], model, search.state_now, actions, allowed):
             raise NotFinite(f"{OUTSIDE}: {problem}")
     except Stop as stop:
-        raise NotFinite(str(stop)) from None
+        kind = Unfinished if isinstance(stop, Limit) else NotFinite
+        raise kind(str(stop)) from None
     finally:
         state.restore_original(without_transparent=False)
     notes = []

@@ -1,15 +1,16 @@
 """Whether an environment does what a model of it says: 20,000 steps of it, outcome by outcome.
 
 One outcome that the model calls impossible refutes it. So does a frequency that lies six standard
-deviations from its expectation: of one outcome of one state and action, or of the first outcomes of
-all states and actions together, the second ones, and so on.
+deviations from its expectation: of one start, of one outcome of one state and action, or of the
+first outcomes of all states and actions together, the second ones, and so on.
 """
 
 from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
@@ -17,13 +18,28 @@ import numpy as np
 
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
-STEPS = 20_000
+STEPS, STEPS_PER_START = 20_000, 40
 MOST_DEVIATIONS = 6.0
 LEGAL = 0.95  # share of steps for which an action is chosen that is allowed
 FEWEST = 9.0  # a variance below which counts are far from normally distributed
 
+NO_START = "the environment starts in a state ({}) that is no start"
+START = (-1, 0)  # the place of `reset` among states and actions
 # Of each state and action: {(next state, -1 at the end; reward, None if random): [chance, count]}.
 Counts = dict[tuple[int, int], dict[Any, list[float]]]
+
+
+@contextmanager
+def seeded_globally(seed: int) -> Iterator[None]:
+    """Seed the global generators, and give them back as they were."""
+    before = random.getstate(), np.random.get_state()  # noqa: NPY002
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        random.setstate(before[0])
+        np.random.set_state(before[1])  # noqa: NPY002
 
 
 def refutation(
@@ -47,41 +63,54 @@ def refutation(
         steps: how many steps to play.
         seed: of the environment, the actions and the global generators, which are restored.
     """
-    before = random.getstate(), np.random.get_state()  # noqa: NPY002
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002
-    rng, state, time, counts = np.random.default_rng(seed), None, 0, Counts()
-    try:
-        for taken in range(steps):
-            if state is None:
-                observation, _ = env.reset(seed=seed if taken == 0 else None)
-                state, time = state_of(observation, 0), 0
-                if state is None or model.initial[state] == 0:
-                    return f"the environment starts in a state ({observation}) that is no start"
-            action = int(rng.integers(len(actions)))
-            if mask is not None and rng.random() < LEGAL:
-                action = int(rng.choice(np.flatnonzero(mask[state])))
-            at = f"state {state}, action {action}"
-            if mask is not None and not mask[state, action]:
-                try:
-                    env.step(actions[action])
-                except Exception:  # noqa: BLE001 (as the model says)
-                    state = None
-                    continue
-                return f"{at}: the environment allows it"
-            result, time = env.step(actions[action]), time + 1
-            following = None if result[2] else state_of(result[0], time)
-            if not _count(model, (state, action), following, result, counts):
-                made = (
-                    "the end" if result[2] else "such a state" if following is None else following
-                )
-                step = f"step to {made} with the reward {float(result[1]):g}"
-                return f"{at}: the model has no {step}, the environment made one"
-            state = None if result[2] or result[3] else following
-        return _unlikely(counts)
-    finally:
-        random.setstate(before[0])
-        np.random.set_state(before[1])  # noqa: NPY002
+    with seeded_globally(seed):
+        return _refutation(env, model, state_of, actions, mask, steps, seed)
+
+
+def _refutation(
+    env: gym.Env[Any, Any],
+    model: TransitionModel,
+    state_of: Callable[[Any, int], int | None],
+    actions: list[Any],
+    mask: Bools | None,
+    steps: int,
+    seed: int,
+) -> str | None:
+    rng, time, starts = np.random.default_rng(seed), 0, model.initial
+    state: int | None = None
+    begun: dict[Any, list[float]] = {
+        (s, 0.0): [starts[s], 0] for s in np.flatnonzero(starts).tolist()
+    }
+    counts: Counts = {START: begun}
+    for taken, action in enumerate(rng.integers(len(actions), size=steps).tolist()):
+        if state is None:
+            observation, _ = env.reset(seed=seed if taken == 0 else None)
+            state, time = state_of(observation, 0), 0
+            if state is None or starts[state] == 0:
+                return NO_START.format(observation)
+        if mask is not None and rng.random() < LEGAL:
+            action = int(rng.choice(np.flatnonzero(mask[state])))
+        at = f"state {state}, action {action}"
+        if mask is not None and not mask[state, action]:
+            try:
+                env.step(actions[action])
+            except Exception:  # noqa: BLE001 (as the model says)
+                state = None
+                continue
+            return f"{at}: the environment allows it"
+        result, time = env.step(actions[action]), time + 1
+        following = None if result[2] else state_of(result[0], time)
+        if not _count(model, (state, action), following, result, counts):
+            made = "the end" if result[2] else "such a state" if following is None else following
+            step = f"step to {made} with the reward {float(result[1]):g}"
+            return f"{at}: the model has no {step}, the environment made one"
+        state = None if result[2] or result[3] else following
+    for _ in range(steps // STEPS_PER_START if len(begun) > 1 else 0):
+        observation, _ = env.reset()
+        if (first := (state_of(observation, 0), 0.0)) not in begun:
+            return NO_START.format(observation)
+        begun[first][1] += 1
+    return _unlikely(counts)
 
 
 def _count(
@@ -104,8 +133,8 @@ def _count(
 
 
 def _rounded(reward: Any) -> float:
-    """A reward to nine digits."""
-    return float(f"{float(reward):.9g}")
+    """A reward to seven digits: some environments compute in single precision."""
+    return float(f"{float(reward):.7g}")
 
 
 def _unlikely(counts: Counts) -> str | None:
@@ -117,8 +146,9 @@ def _unlikely(counts: Counts) -> str | None:
             off, variance = count - n * p, n * p * (1 - p)
             if abs(off) > MOST_DEVIATIONS * math.sqrt(max(variance, FEWEST)):
                 to = "the end" if target < 0 else target
-                came = f"has a probability of {p:.3g}, and came {count:.0f} of {n:.0f} times"
-                return f"state {state}, action {action}: the step to {to} {came}"
+                place = f"state {state}, action {action}: the step to {to}"
+                place = f"reset: the start in state {to}" if (state, action) == START else place
+                return f"{place} has a probability of {p:.3g}, it came {count:.0f} of {n:.0f} times"
             total = together.setdefault(rank, [0.0, 0.0])
             total[:] = total[0] + off, total[1] + variance
     for off, variance in together.values():

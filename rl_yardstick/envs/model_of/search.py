@@ -18,7 +18,7 @@ import numpy as np
 
 from rl_yardstick.envs.model_of.draws import NEVER, Again, Script, Suspect, take_step
 from rl_yardstick.envs.model_of.states import Refuted, Saved, State
-from rl_yardstick.envs.model_of.symbols import Drawn, Stop
+from rl_yardstick.envs.model_of.symbols import Drawn, Limit, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 MOST_ENTRIES = 100_000_000  # of the arrays of a model
@@ -222,7 +222,7 @@ class Search:
         key = self.state.key(variables), self.state.by_value(observation)
         if key not in self.index:
             if len(self.saved) >= self.max_states:
-                raise Stop(f"more than {self.max_states:,} states{self._growing()}")
+                raise Limit(f"more than {self.max_states:,} states{self._growing()}")
             self.saved.append(self.state.save(variables))
             self.observations.append(copy.deepcopy(observation))
         return Outcome(self.index.setdefault(key, len(self.index)), *moments)
@@ -258,7 +258,7 @@ class Search:
             done = f"{len(self.saved):,} states found, {len(self.rows):,} of them done"
             if not self.rows:
                 done = f"`reset` has more than {len(self.saved):,} outcomes"
-            raise Stop(f"no end after {spent:.0f} seconds: {done}{self._growing()}")
+            raise Limit(f"no end after {spent:.0f} seconds: {done}{self._growing()}")
         if self.runs % self.check_every == 0:
             self.state.check_constants()
             if perf_counter() - self.started - spent > 0.05 * spent * self.check_every / self.runs:

@@ -26,6 +26,10 @@ class Stop(BaseException):
     """No model can be found; passes through an environment's own ``except Exception``."""
 
 
+class Limit(Stop):
+    """The search came to one of its limits."""
+
+
 def where() -> str:
     """The file and line of the environment that is running, as ``env.py:110``."""
     frame = sys._getframe(1)

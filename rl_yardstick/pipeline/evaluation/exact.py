@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from rl_yardstick import mdp
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.envs import known_models
+from rl_yardstick.envs import found_models, known_models
+from rl_yardstick.envs.found_models import FoundClaim
 from rl_yardstick.envs.layout import GridLayout, grid_layout
 from rl_yardstick.mdp.beliefs import Bracket, memory_optimum
 from rl_yardstick.mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
@@ -148,6 +149,7 @@ class ExactEvaluator:
     layout: GridLayout | None = None  #: where the states lie on a map, for grid worlds
     masks: Bools | None = None  #: action masks, shape (S, A), for agents that use them
     scale: HiddenScale | None = None  #: the optima if observations hide the state
+    found: FoundClaim | None = None  #: the search, if it found the model
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """Evaluate the agent's current policy exactly."""
@@ -287,7 +289,8 @@ def evaluator_of_single(spec: TrainSpec) -> ExactEvaluator | None:
     known, agent, masks = gym.registry[spec.env_id], ALGORITHMS.get(spec.algo), "mask_actions"
     # Some agents number the members of spaces.
     numbered = None if agent is None else (agent.numbers_spaces, agent.observations, agent.actions)
-    key = repr((known, sorted(kwargs_of(spec).items()), spec.algorithm.get(masks), numbered))
+    own = sorted(kwargs_of(spec).items()), spec.algorithm.get(masks), numbered
+    key = repr((known, own, found_models.limits()))
     # Of the user's own code, the key tells too little.
     is_kept = isinstance(known.entry_point, str) and not (spec.env_wrapper or spec.gym_packages)
     found = _kept.pop(key, None) if is_kept else None
@@ -318,7 +321,10 @@ def evaluator_in(env: gym.Env[Any, Any]) -> ExactEvaluator | None:
     baseline = float(mdp.baseline_return(model, horizon))
     scale = hidden_scale(model, observations, horizon, optimum, baseline)
     yardstick = Yardstick(optimum, baseline) if scale is None else scale.yardstick(False)
-    return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks, scale)
+    found = known_models.found_claim(env)
+    return ExactEvaluator(
+        model, observations, horizon, success, yardstick, layout, masks, scale, found
+    )
 
 
 def _optimum(model: mdp.TransitionModel, horizon: int) -> float | None:
@@ -331,10 +337,11 @@ def _optimum(model: mdp.TransitionModel, horizon: int) -> float | None:
     return mdp.finite_horizon_optimum(model, horizon).start_value
 
 
-def model_refusal(spec: TrainSpec) -> str | None:
-    """Why the environment's own model is rejected, in one line; None if it is accepted."""
+def model_refusal(spec: TrainSpec, only_surprising: bool = True) -> str | None:
+    """Why the environment's model is not known, in one line; None if it is, or no surprise."""
     if is_wrapped_as_vector(spec):
         return None
     with closing(make_single_env(spec)) as env:
         check = known_models.model_check(env)
-    return None if check is None else check.refusal
+    is_told = check is not None and (check.is_surprising or not only_surprising)
+    return check.refusal if check is not None and is_told else None

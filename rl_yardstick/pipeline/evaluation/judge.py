@@ -67,9 +67,13 @@ class Judge:
             self.evaluator = HistoryEvaluator(spec, self.env, world)
         elif exact is None:
             self.evaluator = SampledEvaluator(spec, self.env, scale)
-        if note:
-            console.print(note, style="dim", markup=False, highlight=False)
         self.refusal = None if exact is not None else model_refusal(spec)
+        if exact is not None and exact.found is not None:
+            states = f"{exact.model.n_states:,} states"
+            notes = "; ".join([f"the exact model was found: {states}", *exact.found.notes])
+            console.print(notes, style="dim", markup=False, highlight=False)
+        if note := note or (self.refusal and f"{self.refusal}; figures are sampled"):
+            console.print(note, style="dim", markup=False, highlight=False)
 
 
 # --- histories ------------------------------------------------------------------------------------

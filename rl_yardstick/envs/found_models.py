@@ -1,0 +1,241 @@
+"""Models that a search finds in the code of environments, kept in memory and on disk.
+
+The folder on disk is ``yardstick/models`` in the user's cache. A file's name is a digest of the
+source files, the arguments and the first steps of its environment, and of the limits.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from contextvars import ContextVar
+from dataclasses import asdict, dataclass, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+from zipfile import BadZipFile
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from rl_yardstick.envs.finite_spaces import Bijection
+from rl_yardstick.envs.model_of import FoundModel, NotFinite, Unfinished, model_of
+from rl_yardstick.envs.model_of.check import seeded_globally
+from rl_yardstick.envs.published_models import copy_of
+from rl_yardstick.mdp.transition_model import Bools, TransitionModel
+
+Env = gym.Env[Any, Any]
+
+STEPS_COMPARED = 300  # of the environment, for the name of a file
+SAID_AFTER = 2.0  # seconds of a search
+MOST_FILES = 200
+SECONDS_OF_REFUSALS = 86_400.0  # on a slow day, a search may run out of time
+
+
+class Limits(NamedTuple):
+    """How long a search may take, and how many states it may find."""
+
+    seconds: float = 10.0
+    states: int = 100_000
+
+
+_limits: ContextVar[Limits | None] = ContextVar("limits", default=Limits())  # noqa: B039 (never changes)
+
+
+def limit(text: str) -> None:
+    """Search from now on within the usual limits (``auto``), up to a number of states, or never.
+
+    Args:
+        text: ``auto``, a number such as ``1000000``, or ``none``.
+    """
+    usual = {"auto": Limits(), "none": None}
+    _limits.set(usual[text] if text in usual else Limits(math.inf, int(text)))
+
+
+def limits() -> Limits | None:
+    """The present limits; None where nothing is searched."""
+    return _limits.get()
+
+
+@dataclass(frozen=True, eq=False)
+class FoundClaim:
+    """What a search found of an environment."""
+
+    model: TransitionModel
+    mask: Bools | None  #: actions that raise no error, bool of shape (S, A); None if all
+    observations: NDArray[Any] | None  #: of each state; None where they make no array
+    horizon: int | None  #: the environment's own limit on steps
+    notes: tuple[str, ...]  #: what a reader of the figures should know
+    seconds: float  #: that the search took
+
+
+@dataclass(frozen=True)
+class NotFound:
+    """Why a search found no model."""
+
+    reason: str  #: in one line
+    ends_at_limit: bool = False  #: whether a longer search might find one
+
+
+_NOTHING = NotFound("")
+_of_object: WeakKeyDictionary[Env, tuple[Limits, FoundClaim | NotFound]] = WeakKeyDictionary()
+_of_name: dict[str, FoundClaim | NotFound] = {}
+
+
+def found(core: Env) -> FoundClaim | NotFound | None:
+    """The model of an environment, or why there is none; None if none is to be searched.
+
+    A search leaves the environment as it is: it works on a copy.
+    """
+    wanted, of_project = limits(), type(core).__module__.startswith("rl_yardstick.")
+    if wanted is None or of_project or not isinstance(core.action_space, gym.spaces.Discrete):
+        return None
+    searched, result = _of_object.get(core, (None, _NOTHING))
+    if searched != wanted:
+        result = _by_name(core, wanted)
+        _of_object[core] = wanted, result
+    return result
+
+
+def _by_name(core: Env, limits: Limits) -> FoundClaim | NotFound:
+    """The result of an earlier search in the same code, or of a new one."""
+    try:
+        twin, name = copy_of(core), None
+        if core.spec is not None:
+            name = _name_of(twin, limits)
+    except Exception as error:  # noqa: BLE001  # the environment may raise any
+        return NotFound(f"the environment cannot be copied: {' '.join(str(error).split())}")
+    if name is None:
+        return _search(twin, limits)
+    if name not in _of_name:
+        file = _folder() / f"{name}.npz"
+        result = _read(file)
+        if result is None:
+            result = _search(twin, limits)
+            _write(file, result)
+        _of_name[name] = result
+    return _of_name[name]
+
+
+def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
+    begin, is_said = time.perf_counter(), False
+
+    def progress(n_states: int, _n_done: int) -> None:
+        nonlocal is_said
+        if time.perf_counter() - begin > SAID_AFTER and not is_said:
+            is_said = True
+            most = f"at most {limits.states:,} states"
+            most += "" if math.isinf(limits.seconds) else f", {limits.seconds:g} seconds"
+            print(f"looking for the exact model of {env}: {most}", file=sys.stderr, flush=True)  # noqa: T201
+
+    try:
+        found = model_of(env, seconds=limits.seconds, max_states=limits.states, progress=progress)
+    except NotFinite as error:
+        return NotFound(str(error), isinstance(error, Unfinished))
+    model, observations = found.model, _stacked(env.observation_space, found)
+    notes = tuple(found.notes)
+    return FoundClaim(model, found.mask, observations, found.horizon, notes, found.seconds)
+
+
+def _stacked(space: Any, found: FoundModel) -> NDArray[Any] | None:
+    """The observations in an array, states along the first axis; those of parts side by side."""
+    with suppress(ValueError, TypeError):
+        if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+            digits_of = Bijection(space).digits_of
+            return np.array([digits_of(seen) for seen in found.observations])
+        return np.array(found.observations, space.dtype)
+    return None
+
+
+def _name_of(env: Env, limits: Limits) -> str:
+    """A digest of all that decides what a search finds."""
+    versions = [version(name) for name in ("rl-yardstick", "gymnasium", "numpy")]
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    spec: Any = layers[-1].spec
+    made = [(repr(type(layer)), repr(getattr(layer, "_saved_kwargs", {}))) for layer in layers]
+    digest = hashlib.sha256(repr((limits, versions, made, spec.kwargs)).encode())
+    if not isinstance(spec.entry_point, str):
+        digest.update(cloudpickle.dumps(spec.entry_point))
+    for file in _files_of({kind.__module__ for layer in layers for kind in type(layer).__mro__}):
+        digest.update(Path(file).read_bytes())
+    for seen in _first_steps(env):
+        digest.update(repr(seen).encode())
+    return digest.hexdigest()[:24]
+
+
+def _first_steps(env: Any) -> Iterator[Any]:
+    """What the environment does in its first steps: it may depend on files and settings."""
+    rng, is_over = np.random.default_rng(0), True
+    with seeded_globally(0):
+        for step in range(STEPS_COMPARED):
+            if is_over:
+                yield env.reset(seed=step)[0]
+            try:
+                result = env.step(env.action_space.start + rng.integers(env.action_space.n))
+            except Exception as error:  # noqa: BLE001  # an action may not be allowed
+                yield str(error)
+                return
+            yield result[:4]
+            is_over = result[2] or result[3]
+
+
+def _files_of(modules: set[str]) -> list[str]:
+    """The source files of modules, and of all loaded ones in the same package or folder."""
+    packages = {name.partition(".")[0] for name in modules} - set(sys.stdlib_module_names)
+    loaded = {name: getattr(module, "__file__", None) for name, module in [*sys.modules.items()]}
+    sources = {name: file for name, file in loaded.items() if file and file.endswith(".py")}
+    own = [file for name, file in sources.items() if name.partition(".")[0] in packages]
+    folders = {Path(file).parent for file in own}
+    return sorted(file for file in sources.values() if Path(file).parent in folders)
+
+
+# --- on disk --------------------------------------------------------------------------------------
+
+
+def _folder() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "yardstick" / "models"
+
+
+def _read(file: Path) -> FoundClaim | NotFound | None:
+    """What a file holds; None where there is none, or it cannot be read."""
+    with suppress(OSError, ValueError, KeyError, BadZipFile), np.load(file) as held:
+        arrays = dict(held)
+        told = json.loads(str(arrays.pop("told")))
+        if "reason" in told:
+            is_old = time.time() - file.stat().st_mtime > SECONDS_OF_REFUSALS
+            return None if is_old else NotFound(**told)
+        own = {name: arrays.pop(name, None) for name in ("mask", "observations")}
+        told["notes"] = tuple(told["notes"])
+        return FoundClaim(TransitionModel(**arrays), **own, **told)
+    return None
+
+
+def _write(file: Path, result: FoundClaim | NotFound) -> None:
+    """Write a file, and remove all but the newest; nothing where the folder cannot be written."""
+    arrays, told = dict[str, Any](), dict[str, Any]()
+    if isinstance(result, NotFound):
+        told = asdict(result)
+    else:
+        told = {key: getattr(result, key) for key in ("horizon", "notes", "seconds")}
+        arrays = {each.name: getattr(result.model, each.name) for each in fields(TransitionModel)}
+        arrays |= {"mask": result.mask, "observations": result.observations}
+    kept = {name: array for name, array in arrays.items() if array is not None}
+    with suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        beside = file.with_suffix(f".{os.getpid()}.npz")
+        np.savez_compressed(beside, told=np.array(json.dumps(told)), **kept)
+        beside.replace(file)
+        others = sorted(file.parent.glob("*.npz"), key=lambda path: path.stat().st_mtime)
+        for path in others[:-MOST_FILES]:
+            path.unlink()
