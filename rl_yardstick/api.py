@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property, partial
@@ -39,25 +39,26 @@ from rl_yardstick import agents
 from rl_yardstick.commands import audit as audit_command
 from rl_yardstick.commands import compare as compare_command
 from rl_yardstick.commands import explain as explain_command
+from rl_yardstick.commands import optimum as optimum_command
 from rl_yardstick.commands import train as train_command
 from rl_yardstick.commands import tune as tune_command
 from rl_yardstick.commands.cli import import_typed
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.diagnosis import audit as probes
 from rl_yardstick.diagnosis.explanation import explanation
+from rl_yardstick.envs import known_models
 from rl_yardstick.experiments.plan import StudyRecord, specs_of
 from rl_yardstick.experiments.pool import REGISTRATIONS
 from rl_yardstick.experiments.results import read_evaluations
+from rl_yardstick.mdp.transition_model import TransitionModel
 from rl_yardstick.pipeline import training
-from rl_yardstick.pipeline.environments import check_env_id, with_files_read
+from rl_yardstick.pipeline.environments import check_env_id, make_env
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown, unknown
-from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
 from rl_yardstick.pipeline.files import read_json, read_text
 from rl_yardstick.pipeline.models import Wanted, load_agent, model_of_run
 from rl_yardstick.pipeline.playing import playing_env
 from rl_yardstick.pipeline.run import Run as RunFolder
 from rl_yardstick.pipeline.run import Stop
-from rl_yardstick.pipeline.spec import validated
 from rl_yardstick.report.words import why_lines
 
 
@@ -231,22 +232,27 @@ def audit(algo: str | type, **settings: Any) -> Told:
 
 
 def optimum(env: Any, **env_kwargs: Any) -> Told:
-    """The highest expected return under the time limit, where the environment's model is known.
+    """The highest expected return under the time limit, as ``optimum``.
 
     Returns by name: undiscounted returns ``optimum`` and ``baseline`` (of the best random or
-    constant policy), ``horizon`` (steps), ``values`` (shape (S,)), ``actions`` (those optimal with
-    all steps left, bool (S, A)).
+    constant policy), ``horizon`` (steps), ``states``, ``seconds`` of the search for the model,
+    ``values`` (shape (S,)), ``actions`` (those optimal with all steps left, bool (S, A)).
     """
     env_id, kwargs = _environment(env)
     check_env_id(env_id)
-    entry = with_files_read(env_id, {"env_kwargs": kwargs | env_kwargs})
-    spec = validated({"algo": "optimal", "env_id": env_id, **entry})
-    if (known := exact_evaluator(spec)) is None:
-        raise UserError(model_refusal(spec, False) or f"the model of {env_id} is not known")
-    scale, (values, actions) = known.yardstick, known.optimum
-    figures = {"optimum": scale.optimum, "baseline": scale.baseline, "horizon": known.horizon}
-    lines = [f"{key:<14}{value:,.6g}" for key, value in figures.items()]
-    return Told({**figures, "values": values, "actions": actions}, [env_id, *lines])
+    found = optimum_command.optimum_of(env_id, kwargs | env_kwargs)
+    return Told(found.figures, found.lines)
+
+
+def model(env: Any, **env_kwargs: Any) -> TransitionModel:
+    """The exact `TransitionModel` of a finite environment: its own, or found in its code."""
+    env_id, kwargs = _environment(env)
+    with closing(make_env(env_id, kwargs | env_kwargs)) as made:
+        if (found := known_models.transition_model(made)) is None:
+            check = known_models.model_check(made)
+            reason = "" if check is None else f": {check.refusal}"
+            raise UserError(f"the model of {env_id} is not known{reason}")
+        return found
 
 
 def tune(env: Any, algo: str | type, **settings: Any) -> Told:

@@ -17,6 +17,7 @@ COMMANDS = {
     "compare": "compare agents over seeds, and write a page",
     "tune": "search for an agent's settings, and test them on other seeds",
     "explain": "show where an agent loses return against the optimum",
+    "optimum": "compute the optimum of an environment",
     "rate": "rate Q-tables, models and policies against the exact optimum",
     "check-env": "check an environment for mistakes, without training",
     "shaping": "show whether other rewards in training change the optimum, and their cost",

@@ -83,7 +83,7 @@ def result_lines(evaluation: Evaluation, *more: str) -> list[str]:
     told = judged(evaluation.mean_return, yardstick, n_episodes)
     if evaluation.success_rate is not None:
         told.append(f"success {percent(evaluation.success_rate)}")
-    return [APART.join([*told, *more]), *([] if yardstick is None else _scale_lines(yardstick))]
+    return [APART.join([*told, *more]), *([] if yardstick is None else scale_lines(yardstick))]
 
 
 def judged(value: float, yardstick: Yardstick | None, n_episodes: int = 0) -> list[str]:
@@ -126,7 +126,7 @@ def _returned(
     return f"return {beside}" + (f" ({'; '.join(notes)})" if notes else "")
 
 
-def _scale_lines(yardstick: Yardstick) -> list[str]:
+def scale_lines(yardstick: Yardstick) -> list[str]:
     """What a score of 0 is; and the optimum, if it is bracketed or there are several."""
     baseline = f"return {figures(yardstick.baseline)[0]}{APART}best random or constant policy"
     lines = [f"{'score 0' if yardstick.has_scale else 'no score'}{APART}{baseline}"]

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -141,9 +141,21 @@ def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
         found = model_of(env, seconds=limits.seconds, max_states=limits.states, progress=progress)
     except NotFinite as error:
         return NotFound(str(error), isinstance(error, Unfinished))
-    model, observations = found.model, _stacked(env.observation_space, found)
+    model, observations = _legal(found), _stacked(env.observation_space, found)
     notes = tuple(found.notes)
     return FoundClaim(model, found.mask, observations, found.horizon, notes, found.seconds)
+
+
+def _legal(found: FoundModel) -> TransitionModel:
+    """The model in which an action that is not allowed does what an allowed one does."""
+    model, mask = found.model, found.mask
+    if mask is None:
+        return model
+    states = np.arange(model.n_states)[:, None]
+    action = np.where(mask, np.arange(model.n_actions), mask.argmax(axis=1)[:, None])
+    parts = ("prob", "next_state", "reward", "terminated", "reward_variance")
+    kept: dict[str, Any] = {name: getattr(model, name) for name in parts}
+    return replace(model, **{k: None if v is None else v[states, action] for k, v in kept.items()})
 
 
 def _stacked(space: Any, found: FoundModel) -> NDArray[Any] | None:
@@ -168,7 +180,7 @@ def _name_of(env: Env, limits: Limits) -> str:
     if not isinstance(spec.entry_point, str):
         digest.update(cloudpickle.dumps(spec.entry_point))
     for file in _files_of({kind.__module__ for layer in layers for kind in type(layer).__mro__}):
-        digest.update(Path(file).read_bytes())
+        digest.update(file.read_bytes())
     for seen in _first_steps(env):
         digest.update(repr(seen).encode())
     return digest.hexdigest()[:24]
@@ -190,14 +202,12 @@ def _first_steps(env: Any) -> Iterator[Any]:
             is_over = result[2] or result[3]
 
 
-def _files_of(modules: set[str]) -> list[str]:
-    """The source files of modules, and of all loaded ones in the same package or folder."""
-    packages = {name.partition(".")[0] for name in modules} - set(sys.stdlib_module_names)
-    loaded = {name: getattr(module, "__file__", None) for name, module in [*sys.modules.items()]}
-    sources = {name: file for name, file in loaded.items() if file and file.endswith(".py")}
-    own = [file for name, file in sources.items() if name.partition(".")[0] in packages]
-    folders = {Path(file).parent for file in own}
-    return sorted(file for file in sources.values() if Path(file).parent in folders)
+def _files_of(modules: set[str]) -> list[Path]:
+    """The source files of modules, and those beside them."""
+    known = {name for name in modules if name.partition(".")[0] not in sys.stdlib_module_names}
+    files = {getattr(sys.modules.get(name), "__file__", None) for name in known}
+    folders = {Path(file).parent for file in files if file is not None}
+    return sorted(path for folder in folders for path in folder.glob("*.py"))
 
 
 # --- on disk --------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.envs.known_models import (
+    found_claim,
     model_check,
     observations_of_states,
     one_look,
@@ -426,6 +427,8 @@ def _finite_model(env: Env) -> FiniteModel:
     if watching:
         names = ", ".join(sorted(wrapper.__name__ for wrapper in watching))
         raise NotCompilable(f"{names} must see every step")
+    if found_claim(env) is not None:
+        raise NotCompilable("the environment publishes no model")
     if not check.state_can_be_set:
         raise NotCompilable("the environment does not continue from the state that s is set to")
     monitor = monitor_of(env)

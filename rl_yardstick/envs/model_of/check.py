@@ -82,12 +82,13 @@ def _refutation(
         (s, 0.0): [starts[s], 0] for s in np.flatnonzero(starts).tolist()
     }
     counts: Counts = {START: begun}
-    for taken, action in enumerate(rng.integers(len(actions), size=steps).tolist()):
+    for taken, drawn in enumerate(rng.integers(len(actions), size=steps).tolist()):
         if state is None:
             observation, _ = env.reset(seed=seed if taken == 0 else None)
             state, time = state_of(observation, 0), 0
             if state is None or starts[state] == 0:
                 return NO_START.format(observation)
+        action = drawn
         if mask is not None and rng.random() < LEGAL:
             action = int(rng.choice(np.flatnonzero(mask[state])))
         at = f"state {state}, action {action}"
