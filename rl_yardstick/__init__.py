@@ -3,20 +3,9 @@
 from importlib import import_module
 from typing import Any
 
-_OF_API = (
-    "Run",
-    "Study",
-    "audit",
-    "compare",
-    "explain",
-    "judge",
-    "model",
-    "optimum",
-    "train",
-    "tune",
-)
+_FUNCTIONS = ("audit", "compare", "explain", "judge", "model", "optimum", "train", "tune")
 _ELSEWHERE = {"rate": "rating.ratings", "UserError": "pipeline.errors"}
-_HOMES = dict.fromkeys(_OF_API, "api") | _ELSEWHERE
+_HOMES = dict.fromkeys(("Run", "Study", *_FUNCTIONS), "api") | _ELSEWHERE
 __all__ = list(_HOMES)
 
 

@@ -87,14 +87,10 @@ def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> Optimum:
         *_first_actions(world, np.flatnonzero(model.initial), actions),
         world.map_of(actions.argmax(axis=1), ~model.reachable),
     ]
-    figures: dict[str, Any] = {
-        "optimum": best,
-        "baseline": baseline,
-        "horizon": horizon,
-        "states": n_states,
-    }
-    figures |= {"seconds": None if search is None else search.seconds}
-    return Optimum(figures | {"values": values, "actions": actions}, [*filter(None, lines)])
+    figures = {"optimum": best, "baseline": baseline, "horizon": horizon, "states": n_states}
+    seconds = None if search is None else search.seconds
+    found = {**figures, "seconds": seconds, "values": values, "actions": actions}
+    return Optimum(found, [*filter(None, lines)])
 
 
 def _first_actions(world: World, starts: Ints, actions: Bools) -> Iterator[str]:

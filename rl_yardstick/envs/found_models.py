@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -153,9 +153,11 @@ def _legal(found: FoundModel) -> TransitionModel:
         return model
     states = np.arange(model.n_states)[:, None]
     action = np.where(mask, np.arange(model.n_actions), mask.argmax(axis=1)[:, None])
-    parts = ("prob", "next_state", "reward", "terminated", "reward_variance")
-    kept: dict[str, Any] = {name: getattr(model, name) for name in parts}
-    return replace(model, **{k: None if v is None else v[states, action] for k, v in kept.items()})
+    arrays: dict[str, Any] = {each.name: getattr(model, each.name) for each in fields(model)}
+    for name, array in arrays.items():
+        if name != "initial" and array is not None:
+            arrays[name] = array[states, action]
+    return TransitionModel(**arrays)
 
 
 def _stacked(space: Any, found: FoundModel) -> NDArray[Any] | None:
