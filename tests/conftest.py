@@ -23,9 +23,9 @@ os.environ["MPLBACKEND"] = "Agg"
 for library in ("OMP", "MKL", "OPENBLAS", "NUMBA"):
     os.environ[f"{library}_NUM_THREADS"] = "1"
 
-# The key to saved states is the user's own, which tests leave alone.
+# The key to saved states and the models found are the user's own, which tests leave alone.
 CONFIGURATION = tempfile.TemporaryDirectory(prefix="yardstick-tests-")
-os.environ["XDG_CONFIG_HOME"] = CONFIGURATION.name
+os.environ["XDG_CONFIG_HOME"] = os.environ["XDG_CACHE_HOME"] = CONFIGURATION.name
 
 import rl_yardstick.envs  # noqa: E402, F401  # registers the environments for all tests
 

@@ -140,7 +140,9 @@ def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
     try:
         found = model_of(env, seconds=limits.seconds, max_states=limits.states, progress=progress)
     except NotFinite as error:
-        return NotFound(str(error), isinstance(error, Unfinished))
+        if isinstance(error, Unfinished):
+            return NotFound(f"{error}; --model {10 * limits.states} to go on", ends_at_limit=True)
+        return NotFound(str(error))
     model, observations = _legal(found), _stacked(env.observation_space, found)
     notes = tuple(found.notes)
     return FoundClaim(model, found.mask, observations, found.horizon, notes, found.seconds)

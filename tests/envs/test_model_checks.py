@@ -17,6 +17,7 @@ from rl_yardstick.envs.warehouse import WarehouseEnv
 from rl_yardstick.envs.wrappers import FlattenToDiscrete
 from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 
+
 class Careless(Corridor):
     """Draws from the generators that all code shares."""
 

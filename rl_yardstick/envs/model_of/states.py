@@ -82,7 +82,9 @@ class State:
     def __init__(self, env: Env, script: Script, ignored: Iterable[str]) -> None:
         self.layers: list[Env] = []
         while isinstance(env, gym.Wrapper):
-            if type(env).__name__ not in TRANSPARENT:
+            # Within other wrappers, which may see it, the end of time is a part of the environment.
+            is_seen = bool(self.layers) and isinstance(env, gym.wrappers.TimeLimit)
+            if is_seen or type(env).__name__ not in TRANSPARENT:
                 self.layers.append(env)
             env = env.env
         self.layers.append(env)
