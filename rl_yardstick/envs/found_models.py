@@ -96,8 +96,9 @@ def found(core: Env) -> FoundClaim | NotFound | None:
 
     A search leaves the environment as it is: it works on a copy.
     """
-    wanted, of_project = limits(), type(core).__module__.startswith("rl_yardstick.")
-    if wanted is None or of_project or not isinstance(core.action_space, gym.spaces.Discrete):
+    wanted, is_own = limits(), type(core).__module__.startswith("rl_yardstick.")
+    is_own &= not isinstance(core, gym.Wrapper)
+    if wanted is None or is_own or not isinstance(core.action_space, gym.spaces.Discrete):
         return None
     searched, result = _of_object.get(core, (None, _NOTHING))
     if searched != wanted:
