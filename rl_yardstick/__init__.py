@@ -3,9 +3,20 @@
 from importlib import import_module
 from typing import Any
 
-_OF_API = ("Run", "Study", "audit", "compare", "explain", "judge", "optimum", "train", "tune")
+_API = (
+    "Run",
+    "Study",
+    "audit",
+    "check_env",
+    "compare",
+    "explain",
+    "judge",
+    "optimum",
+    "train",
+    "tune",
+)
 _ELSEWHERE = {"rate": "rating.ratings", "UserError": "pipeline.errors"}
-_HOMES = dict.fromkeys(_OF_API, "api") | _ELSEWHERE
+_HOMES = dict.fromkeys(_API, "api") | _ELSEWHERE
 __all__ = list(_HOMES)
 
 

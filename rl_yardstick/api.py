@@ -44,12 +44,13 @@ from rl_yardstick.commands import tune as tune_command
 from rl_yardstick.commands.cli import import_typed
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.diagnosis import audit as probes
+from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.diagnosis.explanation import explanation
 from rl_yardstick.experiments.plan import StudyRecord, specs_of
 from rl_yardstick.experiments.pool import REGISTRATIONS
 from rl_yardstick.experiments.results import read_evaluations
 from rl_yardstick.pipeline import training
-from rl_yardstick.pipeline.environments import check_env_id, with_files_read
+from rl_yardstick.pipeline.environments import check_env_id, make_env, with_files_read
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown, unknown
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
 from rl_yardstick.pipeline.files import read_json, read_text
@@ -247,6 +248,14 @@ def optimum(env: Any, **env_kwargs: Any) -> Told:
     figures = {"optimum": scale.optimum, "baseline": scale.baseline, "horizon": known.horizon}
     lines = [f"{key:<14}{value:,.6g}" for key, value in figures.items()]
     return Told({**figures, "values": values, "actions": actions}, [env_id, *lines])
+
+
+def check_env(env: Any, **env_kwargs: Any) -> Told:
+    """Check an environment for mistakes, as ``check-env``; returns the findings by their names."""
+    env_id, kwargs = _environment(env)
+    kwargs = {**kwargs, **env_kwargs, "disable_env_checker": True}
+    found = examine(lambda: make_env(env_id, kwargs))
+    return Told({one.name: one for one in found}, [*map(str, found)] or ["nothing found"])
 
 
 def tune(env: Any, algo: str | type, **settings: Any) -> Told:
