@@ -3,18 +3,8 @@
 from importlib import import_module
 from typing import Any
 
-_API = (
-    "Run",
-    "Study",
-    "audit",
-    "check_env",
-    "compare",
-    "explain",
-    "judge",
-    "optimum",
-    "train",
-    "tune",
-)
+_API: tuple[str, ...] = ("Run", "Study", "audit", "check_env", "compare", "explain", "judge")
+_API += ("optimum", "train", "tune")
 _ELSEWHERE = {"rate": "rating.ratings", "UserError": "pipeline.errors"}
 _HOMES = dict.fromkeys(_API, "api") | _ELSEWHERE
 __all__ = list(_HOMES)
