@@ -47,7 +47,7 @@ def said_by(check: Any, make: Any) -> set[str]:
             env = make()
             is_plain = env.spec is not None or isinstance(env, gym.wrappers.TimeLimit)
             check(env.unwrapped if is_plain else env)
-        except Exception as error:  # noqa: BLE001  # an environment may raise any
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # an environment may raise any
             return {str(error)}
     return {str(warning.message) for warning in caught}
 

@@ -3,9 +3,10 @@
 from importlib import import_module
 from typing import Any
 
-_FUNCTIONS = ("audit", "compare", "explain", "judge", "model", "optimum", "train", "tune")
+_API: tuple[str, ...] = ("Run", "Study", "audit", "check_env", "compare", "explain", "judge")
+_API += ("model", "optimum", "train", "tune")
 _ELSEWHERE = {"rate": "rating.ratings", "UserError": "pipeline.errors"}
-_HOMES = dict.fromkeys(("Run", "Study", *_FUNCTIONS), "api") | _ELSEWHERE
+_HOMES = dict.fromkeys(_API, "api") | _ELSEWHERE
 __all__ = list(_HOMES)
 
 

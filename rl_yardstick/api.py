@@ -45,6 +45,7 @@ from rl_yardstick.commands import tune as tune_command
 from rl_yardstick.commands.cli import import_typed
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.diagnosis import audit as probes
+from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.diagnosis.explanation import explanation
 from rl_yardstick.envs import known_models
 from rl_yardstick.experiments.plan import StudyRecord, specs_of
@@ -253,6 +254,14 @@ def model(env: Any, **env_kwargs: Any) -> TransitionModel:
             reason = "" if check is None else f": {check.refusal}"
             raise UserError(f"the model of {env_id} is not known{reason}")
         return found
+
+
+def check_env(env: Any, **env_kwargs: Any) -> Told:
+    """Check an environment for mistakes, as ``check-env``; returns the findings by their names."""
+    env_id, kwargs = _environment(env)
+    kwargs = {**kwargs, **env_kwargs, "disable_env_checker": True}
+    found = examine(lambda: make_env(env_id, kwargs))
+    return Told({one.name: one for one in found}, [*map(str, found)] or ["nothing found"])
 
 
 def tune(env: Any, algo: str | type, **settings: Any) -> Told:

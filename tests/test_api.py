@@ -77,6 +77,14 @@ def test_a_run_is_the_command_s(run, typed):
     assert "data:image/png;base64," in run._repr_html_()
 
 
+def test_findings_of_an_environment_by_name():
+    found = ys.check_env(Line)
+    assert {name: one.level for name, one in found.items()} == {"step-after-end": "note"}
+    assert repr(ys.check_env("FrozenLake-v1", is_slippery=False)) == "nothing found"
+    with pytest.raises(UserError, match="unknown argument 'size'"):
+        ys.check_env("FrozenLake-v1", size=3)
+
+
 def test_the_optimum_is_that_of_the_arguments():
     dry = ys.optimum(gym.make("FrozenLake-v1", is_slippery=False, max_episode_steps=50))
     assert (dry["optimum"], dry["horizon"], dry["values"][0]) == (1, 50, 1)

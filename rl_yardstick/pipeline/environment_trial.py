@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,16 +29,16 @@ from rl_yardstick.pipeline.errors import UserError, shown
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
 SEED, N_STEPS = 0, 200
-MOST_SECONDS = 5.0  # after which a slow environment has been tried long enough
-LARGE = 10_000  # bytes of an observation of which the hash is enough
+MOST_SECONDS = 2.0  # after which a slow environment has been played long enough
 KNOWN = ("rl_yardstick", "gymnasium", "ale_py")
 WITHOUT_EPISODE = "rl_yardstick.envs.wrappers.WithoutEpisodeInfo"
 UNUSABLE = ("old-api", "observation-not-in-space")  # nothing can learn there
-STATISTICS = ("RecordEpisodeStatistics", "Monitor")  # wrappers that write info["episode"]
-RESERVED = ("terminal_observation", "TimeLimit.truncated", "final_obs", "final_info")
-# By the name of each kind of finding: its level, and how to mend it.
+# By the name of each kind of finding, the worst first: its level, and how to mend it.
 KINDS = json.loads(Path(__file__).with_name("environment_findings.json").read_text("utf-8"))
 ACTION, START = "observation, reward, terminated, truncated, info", "observation, info"
+TYPES = object, Real, bool | np.bool_, bool | np.bool_, Mapping  # of `ACTION`
+STATISTICS = ("RecordEpisodeStatistics", "Monitor")  # wrappers that write info["episode"]
+RESERVED = {"episode", "terminal_observation", "TimeLimit.truncated", "final_obs", "final_info"}
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,10 @@ class Finding:
     where: str  #: a step, an attribute, a file and line; may be empty
     mend: str
 
+    def __str__(self) -> str:
+        where = f" ({self.where})" if self.where else ""
+        return f"{self.level:<6}  {self.name}: {self.what}{where}; {self.mend}"
+
 
 class Findings(dict[str, Finding]):
     """The first finding of each name."""
@@ -57,72 +62,70 @@ class Findings(dict[str, Finding]):
     def add(self, name: str, what: str, where: str = "") -> None:
         """Add a finding, unless that name was found before; long texts are shortened."""
         level, mend = KINDS[name]
-        text = " ".join(what.split())
-        self.setdefault(name, Finding(level, name, text[:160], where, mend))
+        self.setdefault(name, Finding(level, name, " ".join(what.split())[:160], where, mend))
 
 
 class Step(NamedTuple):
-    """The outcome of a step, or the start of an episode."""
+    """The outcome of a step, with digests in place of observations."""
 
-    obs: Any
+    obs: int
     reward: float = 0.0
     terminated: bool = False
     truncated: bool = False
-    is_start: bool = False
+    start: int | None = None  #: the first observation of the next episode, if this one ended
     seconds: float = 0.0
 
 
-# --- playing --------------------------------------------------------------------------------------
-
-
 def play(
+    found: Findings,
     env: Env,
     n_steps: int,
-    until: float,
-    found: Findings,
-    seed: int | None = SEED,
     before: Callable[[], object] = lambda: None,
     same_action: bool = False,
 ) -> list[Step]:
     """Play episodes with random actions, the same ones each time, and look at every step.
 
-    No step begins after the moment ``until`` of `time.monotonic`. The seed is that of the first
-    reset. ``before`` is called before each step; ``same_action`` repeats an episode's first action.
+    ``before`` is called before each step; ``same_action`` repeats an episode's first action.
     """
     # An environment may make its own space anew, or seed it, in `reset`.
-    space, actions, layers = env.observation_space, copy.deepcopy(env.action_space), layers_of(env)
+    space, actions = env.observation_space, copy.deepcopy(env.action_space)
     actions.seed(SEED)
-    obs, _ = env.reset(seed=seed)
-    steps, action = [Step(_kept(obs), is_start=True)], None
+    obs, action, until = env.reset(seed=SEED)[0], None, time.monotonic() + MOST_SECONDS
     _look_at_observation(found, space, obs, "step 0")
-    for number in range(1, n_steps + 1):
-        if time.monotonic() > until:
-            break
-        where = f"step {number}"
+    steps = [Step(seen := digest(obs))]
+    while len(steps) <= n_steps and time.monotonic() < until:
+        where = f"step {len(steps)}"
         before()
         action = action if same_action and action is not None else _chosen(env, actions)
-        given, begin = copy.deepcopy(action), time.perf_counter()
-        outcome = env.step(given)
+        begin = time.perf_counter()
+        outcome = env.step(copy.deepcopy(action))
         seconds = time.perf_counter() - begin
-        if not same(given, action):
-            found.add("action-changed", "step changes the array of its action", where)
-        if not same(_kept(obs), steps[-1].obs):
+        if digest(obs) != seen:
             found.add("observation-in-place", "a step changes the last observation", where)
         obs, _, terminated, truncated, _ = outcome
         _look_at_observation(found, space, obs, where)
-        ends = bool(terminated), bool(truncated)
-        paid = _look_at_outcome(found, layers, outcome, where)
-        steps.append(Step(_kept(obs), paid, *ends, seconds=seconds))
-        if any(ends):
+        reward, seen = _look_at_outcome(found, layers_of(env), outcome, where), digest(obs)
+        step = Step(seen, reward, bool(terminated), bool(truncated), seconds=seconds)
+        if terminated or truncated:
             obs, action = env.reset()[0], None
-            steps.append(Step(_kept(obs), is_start=True))
             _look_at_observation(found, space, obs, where)
+            step = step._replace(start=(seen := digest(obs)))
+        steps.append(step)
     return steps
 
 
 def layers_of(env: Any) -> list[Any]:
     """The wrappers of an environment from the outermost on, and the environment itself."""
     return [env, *(layers_of(env.env) if isinstance(env, gym.Wrapper) else [])]
+
+
+def digest(value: Any) -> int:
+    """A hash of an observation, equal where all numbers and texts are."""
+    if isinstance(value, Mapping | tuple):
+        parts = value.values() if isinstance(value, Mapping) else value
+        return hash(tuple(map(digest, parts)))
+    array = np.asarray(value)
+    return hash(array.shape if array.dtype.hasobject else array.tobytes())
 
 
 def _chosen(env: Env, actions: Any) -> Any:
@@ -133,33 +136,10 @@ def _chosen(env: Env, actions: Any) -> Any:
     return actions.sample(mask=masks.astype(np.int8))
 
 
-def _kept(obs: Any) -> Any:
-    """A copy of an observation, or the hash of a large one."""
-    if not isinstance(obs, np.ndarray):
-        return copy.deepcopy(obs)
-    return hash(obs.tobytes()) if obs.nbytes > LARGE else obs.copy()
-
-
-def same(one: Any, other: Any) -> bool:
-    """Whether two observations, or lists of them, are equal; nan is equal to nan."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        return len(one) == len(other) and all(map(same, one, other))
-    if isinstance(one, float | np.ndarray):
-        is_float = np.asarray(one).dtype.kind == "f"
-        return bool(np.array_equal(one, other, equal_nan=is_float))
-    return bool(one == other)
-
-
 def first_difference(one: list[Step], other: list[Step]) -> str:
     """The first step in which two plays differ; empty if there is none."""
-    pairs = list(zip(one, other, strict=False))
-    at = next((k for k, (a, b) in enumerate(pairs) if not same(a[:4], b[:4])), None)
-    return "" if at is None else f"step {sum(not step.is_start for step in one[: at + 1])}"
-
-
-# --- looking --------------------------------------------------------------------------------------
+    pairs = enumerate(zip(one, other, strict=False))
+    return next((f"step {number}" for number, (a, b) in pairs if a[:5] != b[:5]), "")
 
 
 def look_at_calls(found: Findings, env: Any) -> None:
@@ -172,13 +152,13 @@ def look_at_calls(found: Findings, env: Any) -> None:
         told = "Gymnasium calls reset(seed=..., options=...), which the environment does not take"
         found.add("old-api", told, "reset")
         return
-    if not isinstance(given, tuple) or len(given) != 2:
-        found.add("old-api", f"reset returns one value, not {START}", "reset")
-        return
-    given = env.step(copy.deepcopy(env.action_space).sample())
-    if not isinstance(given, tuple) or len(given) != 5:
-        told = f"{len(given)} values" if isinstance(given, tuple) else "one value"
-        found.add("old-api", f"step returns {told}, not {ACTION}", "step")
+    for call, wanted in (("reset", START), ("step", ACTION)):
+        if call == "step":
+            given = env.step(copy.deepcopy(env.action_space).sample())
+        if not isinstance(given, tuple) or len(given) != len(wanted.split()):
+            told = f"{len(given)} values" if isinstance(given, tuple) else "one value"
+            found.add("old-api", f"{call} returns {told}, not {wanted}", call)
+            return
 
 
 def look_at_seed(found: Findings, one: list[Step], other: list[Step]) -> None:
@@ -197,54 +177,44 @@ def _look_at_observation(found: Findings, space: Any, obs: Any, where: str) -> N
         return
     array = np.asarray(obs) if isinstance(space, spaces.Box) else np.zeros(0)
     is_number, is_array = array.dtype.kind in "fiub", isinstance(obs, np.ndarray)
-    is_finite = is_number and (is_array or not array.size) and bool(np.isfinite(array).all())
-    if is_finite and space.contains(obs):
+    is_finite = is_number and bool(np.isfinite(array).all())
+    if is_finite and space.contains(obs) and (is_array or not isinstance(space, spaces.Box)):
         return
     name, told = "observation-not-in-space", f"the observation {shown(obs)} is not in {space}"
     if isinstance(space, spaces.Box) and array.shape != space.shape:
         told = f"the observation has the shape {array.shape}, and its space the shape {space.shape}"
+    elif is_number and not is_finite:
+        name, told = "observation-nan", "the observation holds nan or infinity"
     elif isinstance(space, spaces.Box) and is_number:
-        if not np.isfinite(array).all():
-            name, told = "observation-nan", "the observation holds nan or infinity"
-        elif not ((array >= space.low) & (array <= space.high)).all():
+        name, kind = "observation-dtype", array.dtype if is_array else f"a {type(obs).__name__}"
+        told = f"observations are {kind}, and their space is {space.dtype}"
+        if not ((array >= space.low) & (array <= space.high)).all():
             told = f"observations leave their space: values from {array.min():g} to {array.max():g}"
             name = "observation-out-of-bounds"
-        else:
-            kind = array.dtype if is_array else f"a {type(obs).__name__}"
-            told = f"observations are {kind}, and their space is {space.dtype}"
-            name = "observation-dtype"
     found.add(name, told, where)
 
 
 def _look_at_outcome(found: Findings, layers: list[Any], outcome: Any, where: str) -> float:
-    """Look at the types and names in the rest of a step's outcome; return the reward."""
+    """Look at the types, numbers and names in the rest of an outcome; return the reward."""
+    for name, kind, value in zip(ACTION.split(", "), TYPES, outcome, strict=True):
+        if not isinstance(value, kind):
+            found.add("outcome-type", f"{name} is {shown(value)}", where)
     _, reward, terminated, truncated, info = outcome
-    if np.ndim(reward) or isinstance(reward, str | complex | None):
-        found.add("reward-type", f"the reward is {shown(reward)}", where)
-        reward = np.asarray(reward).flat[0] if np.ndim(reward) else 0.0
-    elif not np.isfinite(reward):
+    reward = float(reward) if isinstance(reward, Real) else 0.0
+    if not math.isfinite(reward):
         found.add("reward-nan", f"the reward is {reward}", where)
-    if not all(isinstance(value, bool | np.bool_) for value in (terminated, truncated)):
-        found.add("end-type", f"terminated, truncated are {terminated!r}, {truncated!r}", where)
-    for layer in [each for each in layers if isinstance(each, gym.wrappers.TimeLimit)]:
-        taken: Any = layer._elapsed_steps
-        if not truncated and taken >= layer._max_episode_steps:
-            told = "the time limit ends the episode, and truncated is False"
-            found.add("truncation-lost", told, where)
-    if not isinstance(info, Mapping):
-        found.add("info-type", f"info is {shown(info)}", where)
-        info = {}
-    has_statistics = any(type(layer).__name__ in STATISTICS for layer in layers)
-    if "episode" in info and not (has_statistics and (terminated or truncated)):
-        told = "the environment's own info['episode'] is left out of trainings"
-        found.add("info-episode", told, where)
-    for key in info.keys() & {*RESERVED}:
+        reward = 0.0
+    limits: list[Any] = [layer for layer in layers if isinstance(layer, gym.wrappers.TimeLimit)]
+    if not truncated and any(one._elapsed_steps >= one._max_episode_steps for one in limits):
+        found.add("truncation-lost", "a time limit ends the episode, and truncated is False", where)
+    is_counted = any(type(layer).__name__ in STATISTICS for layer in layers)
+    own = RESERVED & info.keys() if isinstance(info, Mapping) else set()
+    if "episode" in own and not (is_counted and (terminated or truncated)):
+        found.add("info-episode", "the environment's own info['episode'] is left out", where)
+    for key in own - {"episode"}:
         if key != "TimeLimit.truncated" or info[key] != (truncated and not terminated):
             found.add("info-key", f"the environment's own info[{key!r}] is overwritten", where)
-    return float(reward)
-
-
-# --- before a training ----------------------------------------------------------------------------
+    return reward
 
 
 def tried(spec: TrainSpec) -> tuple[TrainSpec, list[str]]:
@@ -257,9 +227,14 @@ def tried(spec: TrainSpec) -> tuple[TrainSpec, list[str]]:
     import torch as th
 
     states = random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
+    make = partial(make_single_env, spec, training=True, disable_env_checker=True)
     found = Findings()
     with suppress(Exception, SystemExit):  # of the user's code: training will meet it
-        _look_at_two_copies(found, spec)
+        with closing(make()) as env:
+            look_at_calls(found, env.unwrapped)
+        with closing(make()) as env, closing(make()) as other:
+            if not found:
+                look_at_seed(found, play(found, env, N_STEPS), play(found, other, N_STEPS))
     random.setstate(states[0])
     np.random.set_state(states[1])  # noqa: NPY002
     th.set_rng_state(states[2])
@@ -269,16 +244,3 @@ def tried(spec: TrainSpec) -> tuple[TrainSpec, list[str]]:
     if "info-episode" in found:
         spec = spec.changed(env_wrapper=[*spec.env_wrapper, Component(name=WITHOUT_EPISODE)])
     return spec, [f"{one.what} (from {one.where} on): {one.mend}" for one in found.values()]
-
-
-def _look_at_two_copies(found: Findings, spec: TrainSpec) -> None:
-    make = partial(make_single_env, spec, training=True, disable_env_checker=True)
-    with closing(make()) as env:
-        look_at_calls(found, env.unwrapped)
-    if found:
-        return
-    with closing(make()) as env:
-        one = play(env, N_STEPS, time.monotonic() + MOST_SECONDS, found)
-    with closing(make()) as env:
-        n_steps = sum(not step.is_start for step in one)
-        look_at_seed(found, one, play(env, n_steps, math.inf, found))

@@ -54,6 +54,7 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> Env:
         return gym.make(env_id, **kwargs)
     except MISTAKES as error:
         parameters = _parameters(env_id)
+        kwargs = {key: value for key, value in kwargs.items() if key != "disable_env_checker"}
         known = [*parameters, "max_episode_steps", "render_mode"]  # of `gymnasium.make` itself
         foreign = [name for name in kwargs if name not in known]
         takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())

@@ -14,10 +14,9 @@ from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 class Ferry(gym.Env):
     """Crosses a windy river of 6 by 6 places, and is paid if it lands high on the other shore."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012  # as Gymnasium's
+    metadata = {}  # noqa: RUF012  # as Gymnasium's
 
-    def __init__(self, render_mode=None):
-        self.render_mode = render_mode
+    def __init__(self):
         self.observation_space = spaces.Box(0, 5, (2,), np.float32)
         self.action_space = spaces.Discrete(3)
 
@@ -40,9 +39,6 @@ class Ferry(gym.Env):
     def seen(self):
         return self.place.astype(np.float32)
 
-    def render(self):
-        return np.full((8, 8, 3), self.place[0], np.uint8)
-
 
 class Swallowing(gym.Wrapper):
     def step(self, action):
@@ -62,28 +58,34 @@ LOG = []
 # Texts in the source of the ferry.
 SPACE, ACTIONS, SEEDED = "spaces.Box(0, 5, (2,), np.float32)", "spaces.Discrete(3)", "(seed=seed)"
 DRAW, SEEN = "self.np_random.integers(n)", "self.place.astype(np.float32)"
-MOVE = "self.place[1] + action - 1"
 DONE, PAY, INFO = (
     "bool(self.place[0] == 5)",
     "float(done and self.place[1] > 2)",
     '"time": self.time',
 )
-TIME, FRAME = "self.time += 1", "np.full((8, 8, 3), self.place[0], np.uint8)"
+TIME = "self.time += 1"
 STARTS = "self.initial_state_distrib = np.eye(5)[0]"
 OWN = f"{ACTIONS}; self.own = np.random.default_rng"
 KEY = "spaces.Dict(at=spaces.Discrete(6))"
 FROM_TWO = "spaces.Dict(at=spaces.Discrete(6, start=2))"
+LOGGED = "(self, n, log=[]):\n        log.append(n); n -= len(log) % 5 == 0\n"
 CLEARING = "(seed=seed); LOG.clear()"
 TREASURE = (TIME, f"{TIME}; self.found |= self.time > 4", ACTIONS, f"{ACTIONS}; self.found = False")
 ARRAY = (ACTIONS, f"{ACTIONS}; self.array = np.zeros(2, np.float32)")
-CLIP = "self.place[1] + np.clip(action, -0.5, 0.5, out=action)[0]"
 # What has to be found; the fault; texts in the source, each with another one in its place.
 CHANGES = [
     ("seed", "numpy's generator", DRAW, "np.random.randint(n)"),
     ("seed", "Python's generator", DRAW, "random.randrange(n)"),
     ("seed", "the time of day", DRAW, "time.perf_counter_ns() // 64 % n"),
     ("seed", "a generator of its own", DRAW, "self.own.integers(n)", ACTIONS, f"{OWN}()"),
-    ("seed", "a seed of its own", DRAW, "self.own.integers(n)", ACTIONS, f"{OWN}(3)"),
+    (
+        "state-survives-reset",
+        "a seed of its own",
+        DRAW,
+        "self.own.integers(n)",
+        ACTIONS,
+        f"{OWN}(3)",
+    ),
     ("global-generator", "numpy is seeded", SEEDED, "(seed=seed); np.random.seed(seed)"),
     ("reset-repeats", "the same seed again", SEEDED, "(seed=seed or 5)"),
     ("shared-state", "a global list", PAY, "LOG.append(1) or float(len(LOG))"),
@@ -93,6 +95,7 @@ CHANGES = [
         PAY,
         "self.metadata.update({len(self.metadata): 1}) or len(self.metadata)",
     ),
+    ("shared-state", "a default argument", "(self, n):\n", LOGGED),
     ("shared-state", "a cleared list", PAY, "LOG.append(1) or len(LOG)", SEEDED, CLEARING),
     ("state-survives-reset", "a treasure stays found", *TREASURE, PAY, "float(self.found)"),
     ("observation-in-place", "the place", SEEN, "self.place", "np.float32", "np.int64"),
@@ -110,18 +113,17 @@ CHANGES = [
     ("observation-dtype", "double precision", SEEN, "self.place * 1.0"),
     ("observation-dtype", "a list", SEEN, "[float(x) for x in self.place]"),
     ("observation-nan", "nan", SEEN, "np.array([np.nan if self.time == 3 else 1, 1], 'f4')"),
-    ("observation-constant", "nothing to see", SEEN, "np.ones(2, np.float32)"),
     ("reward-nan", "nan as reward", PAY, "np.nan if self.time == 3 else 0.0"),
     ("reward-nan", "infinity as reward", PAY, "np.inf if self.time > 4 else 0.0"),
-    ("reward-type", "a reward in an array", PAY, "np.ones(1)"),
-    ("reward-type", "no reward", PAY, "None"),
+    ("outcome-type", "a reward in an array", PAY, "np.ones(1)"),
+    ("outcome-type", "no reward", PAY, "None"),
     ("reward-huge", "a million", PAY, "1e6 * done"),
     ("reward-never", "never a reward", PAY, "0.0"),
     ("info-episode", "info['episode']", INFO, "'episode': self.time"),
     ("info-key", "the last observation", INFO, "'terminal_observation': self.seen()"),
     ("info-key", "always a time limit", INFO, "'TimeLimit.truncated': True"),
-    ("info-type", "no info", f"{{{INFO}}}", "None"),
-    ("end-type", "an end that is a number", DONE, "int(self.place[0] == 5)"),
+    ("outcome-type", "no info", f"{{{INFO}}}", "None"),
+    ("outcome-type", "an end that is a number", DONE, "int(self.place[0] == 5)"),
     (
         "space-start",
         "actions from 1",
@@ -138,23 +140,19 @@ CHANGES = [
         f"{SEEDED}; self.observation_space = spaces.Box(0, 9, (2,))",
     ),
     ("space-remade", "a new space", SEEDED, f"{SEEDED}; self.action_space = {ACTIONS}"),
-    ("action-bounds", "no bounds", ACTIONS, "spaces.Box(-np.inf, np.inf, ())"),
-    ("action-changed", "clipped in place", ACTIONS, "spaces.Box(-1, 1, (1,))", MOVE, CLIP),
     ("no-space", "no action space", ACTIONS, "3"),
     ("old-api", "reset without a seed", "(self, *, seed=None, options=None)", "(self, seed=None)"),
     ("old-api", "four things from step", "done, False, info", "done, info"),
     ("limit-as-terminated", "a limit as an end", DONE, "self.time >= 20"),
     ("step-after-end", "life after an end", DONE, "self.time % 7 == 6", PAY, "1.0"),
     ("goal-unreachable", "a wall", ACTIONS, f"{ACTIONS}; self.P = corridor(3); {STARTS}"),
-    ("model", "no model", ACTIONS, f"{ACTIONS}; self.P = {{0: {{0: [(0.5, 0, 0, 1)]}}}}; {STARTS}"),
-    ("render", "a frame of fractions", FRAME, "np.zeros((8, 8, 3))"),
-    ("render", "a forgotten mode", "self.render_mode = render_mode", "pass"),
-    ("render-changes", "drawing draws", FRAME, f"np.full_like({FRAME}, self.drawn(9))"),
     ("not-copyable", "a lock", ACTIONS, f"{ACTIONS}; self.lock = threading.Lock()"),
     ("slow", "a slow step", TIME, f"{TIME}; time.sleep(0.005)"),
-    ("prints", "it prints", TIME, f"{TIME}; print('at', self.place)"),
     ("crash", "it raises", TIME, f"{TIME}; action = action if self.time < 5 else {{}}['key']"),
+    ("crash", "it ends the process", TIME, f"{TIME}; raise SystemExit(0)"),
+    ("crash", "no model", ACTIONS, f"{ACTIONS}; self.P = {{0: {{0: [(0.5, 0, 0, 1)]}}}}; {STARTS}"),
 ]
+
 CLOCK = (SPACE, "spaces.Box(0, 1, (1,))", SEEN, "np.array([self.time / 20], np.float32)")
 
 
@@ -166,7 +164,7 @@ def maker(changes=(), wrap=lambda env: TimeLimit(env, 40)):
         source = source.replace(old, new)
     inside = dict(globals())
     exec(source, inside)  # noqa: S102  # the source above
-    return lambda **kwargs: wrap(inside["Ferry"](**kwargs))
+    return lambda: wrap(inside["Ferry"]())
 
 
 WRAPPED = [
@@ -178,7 +176,7 @@ PLANTED |= {fault: (name, maker((), wrap)) for name, fault, wrap in WRAPPED}
 PLANTED["no end"] = ("no-end", maker((DONE, "False"), lambda env: env))
 RIGHT = {
     "ferry": maker(),
-    "it shows the time": maker((*CLOCK, DONE, "self.time >= 20")),
     "an open corridor": maker((ACTIONS, f"{ACTIONS}; self.P = corridor(5); {STARTS}")),
+    "it shows the time": maker((*CLOCK, DONE, "self.time >= 20")),
     "a right key": maker((INFO, "'TimeLimit.truncated': False")),
 }

@@ -2,6 +2,8 @@
 
 import json
 import re
+import signal
+import sys
 
 import gymnasium as gym
 import pytest
@@ -22,7 +24,7 @@ LINE = (
 
 @pytest.fixture(autouse=True)
 def short_plays(monkeypatch):
-    shorter = {"N_PLAYED": 200, "N_LONG": 1000, "N_SEEDED": 60, "START_STEPS": 10}
+    shorter = {"N_PLAYED": 200, "N_LONG": 1000, "N_SEEDED": 60}
     for name, n_steps in shorter.items():
         monkeypatch.setattr(environment_checks, name, n_steps)
 
@@ -35,7 +37,9 @@ def test_a_planted_fault_is_found_under_its_name_and_nothing_else_breaks(fault):
     assert [one for one in found.values() if one.level == "breaks" and one.name != name] == []
 
 
-def test_every_kind_of_finding_is_planted():
+def test_every_kind_of_finding_is_planted_and_the_worst_come_first():
+    levels = [level for level, _ in KINDS.values()]
+    assert levels == sorted(levels, key=["breaks", "bites", "note"].index)
     assert {name for name, _ in PLANTED.values()} == set(KINDS)
 
 
@@ -49,7 +53,7 @@ def test_no_false_alarm(env_id, tmp_path):
     log = tmp_path / "log.csv"
     log.write_text("segment,arm,reward,propensity\n" + "core,0,1,0.5\ncasual,1,0,0.5\n" * 500)
     kwargs = {"log": str(log)} if env_id == "ReplayBandit-v0" else {}
-    found = examine(lambda **extra: gym.make(env_id, disable_env_checker=True, **kwargs, **extra))
+    found = examine(lambda: gym.make(env_id, disable_env_checker=True, **kwargs))
     assert [one for one in found if one.level != "note"] == []
 
 
@@ -75,7 +79,66 @@ def test_the_command(monkeypatch, capsys, tmp_path, is_terminal):
             continue
         assert findings[0]["level"] == level
         assert {*findings[0]} == {"level", "name", "what", "where", "mend"}
-        assert any(line.startswith("┃ level") for line in lines) == is_terminal
-        assert any(line.startswith(f"{level} ") for line in lines) != is_terminal
+        assert any(line.startswith(f"{level} ") for line in lines)
         assert max(map(len, lines)) <= 80 + 20 * (not is_terminal), lines
-        assert lines[-1].startswith("Ferry-v0: 1 finding in ")
+        assert lines[-1].startswith("Ferry-v0: 1 found in ")
+
+
+ODD = """
+import time
+from gymnasium.envs.toy_text import FrozenLakeEnv
+
+class Lake(FrozenLakeEnv):
+    pass
+
+class Raising(FrozenLakeEnv):
+    def __init__(self):
+        raise RuntimeError("no licence")
+
+class Leaving(FrozenLakeEnv):
+    def __init__(self):
+        raise SystemExit(0)
+
+class Agents(FrozenLakeEnv):
+    def __init__(self):
+        self.observation_space = lambda agent: None
+
+class Sized(FrozenLakeEnv):
+    def __init__(self, size):
+        super().__init__()
+
+class Endless(FrozenLakeEnv):
+    def step(self, action):
+        time.sleep(60)
+
+class Plain:
+    metadata = {"render_modes": []}
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "line"),
+    [
+        (["odd.py:Lake"], 0, "Lake: nothing found in "),
+        (["odd:Lake", "--env-kwargs", "is_slippery:False"], 0, "Lake: nothing found in "),
+        (["odd.py:Raising"], 1, "breaks crash: RuntimeError: no licence (odd.py:10); see the"),
+        (["odd.py:Leaving"], 1, "breaks crash: SystemExit: 0 (odd.py:14); see the message"),
+        (["odd.py:Agents"], 1, "breaks no-space: observation_space is no gymnasium space"),
+        (["odd.py:Endless"], 0, "bites slow: the checks took too long here (odd.py:26); profile"),
+        (["odd.py:Sized"], 2, "Sized: Sized.__init__() missing 1 required positional argument: 's"),
+        (["odd.py:Sized", "--env-kwargs", "sise:3"], 2, "Sized: unknown argument 'sise': did you"),
+        (["odd.py:Plain"], 2, "Plain: The environment must inherit from the gymnasium.Env class"),
+        (["odd.py:None"], 2, "unknown environment 'None'"),
+        (["elsewhere:Lake"], 2, "elsewhere: no module named elsewhere"),
+    ],
+)
+def test_what_is_typed(typed, monkeypatch, tmp_path, words, code, line):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "odd.py").write_text(ODD)
+    alarm = signal.alarm
+    monkeypatch.setattr(signal, "alarm", lambda seconds: alarm(min(seconds, 2)))
+    found, out, err = typed("yardstick", "check-env", *words)
+    assert (found, "Traceback" in err) == (code, False)
+    assert line in " ".join((out + err).split())
+    gym.registry.pop(words[0].partition(":")[2], None)
+    sys.modules.pop("odd", None)
