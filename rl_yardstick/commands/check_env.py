@@ -30,18 +30,13 @@ def main() -> int:
     """Print the findings; return 1 if one of them breaks trainings."""
     args, begin = build_parser().parse_args(), time.monotonic()
     cli.import_typed(args)
-    from gymnasium.envs.registration import EnvSpec, registry
-
+    cli.register_typed(args)
     from rl_yardstick.commands.terminal import table_console
     from rl_yardstick.diagnosis.environment_checks import LATE, examine
-    from rl_yardstick.pipeline.components import module_name
     from rl_yardstick.pipeline.environments import make_env
     from rl_yardstick.pipeline.files import write_json
     from rl_yardstick.pipeline.settings import parse_assignments
 
-    typed = sys.modules.get(module_name(args.gym_packages[-1])) if args.gym_packages else None
-    if args.env not in registry and callable(kind := getattr(typed, args.env, None)):
-        registry[args.env] = EnvSpec(args.env, kind)
     kwargs = {**parse_assignments(args.env_kwargs, "--env-kwargs"), "disable_env_checker": True}
     signal.signal(signal.SIGALRM, lambda *_: sys.exit(LATE))
     signal.alarm(max(17 - int(time.monotonic() - begin), 5))  # seconds; a call may hang

@@ -295,6 +295,17 @@ def import_typed(args: argparse.Namespace) -> None:
         found_models.limit(args.exact_model or "auto")
 
 
+def register_typed(args: argparse.Namespace) -> None:
+    """Register the class of ``--env module:Class``, or a function that makes an environment."""
+    from gymnasium.envs.registration import EnvSpec, registry
+
+    from rl_yardstick.pipeline.components import module_name
+
+    typed = sys.modules.get(module_name(args.gym_packages[-1])) if args.gym_packages else None
+    if args.env not in registry and callable(kind := getattr(typed, args.env, None)):
+        registry[args.env] = EnvSpec(args.env, kind)
+
+
 def check_alone(
     parser: OneLineParser, beside: Collection[str], what: str = "--resume: the run has its own"
 ) -> None:

@@ -18,6 +18,7 @@ EPILOG = """\
 examples:
   python -m rl_yardstick optimum --env FrozenLake-v1 --env-kwargs map_name:8x8
   python -m rl_yardstick optimum --env Taxi-v4 --env-kwargs fickle_passenger:True --model 1000000
+  python -m rl_yardstick optimum --env my_world.py:World   # a class; its code runs
 """
 MOST_STARTS, APART = 3, " " * 3  # starts that are named; between words and figures
 
@@ -25,7 +26,7 @@ MOST_STARTS, APART = 3, " " * 3  # starts that are named; between words and figu
 def build_parser() -> OneLineParser:
     """The flags."""
     words = "Compute the highest expected return of any policy, exactly."
-    told = flag("--env", "environment id", required=True, metavar="ID")
+    told = flag("--env", "environment id, or module:Class", required=True, metavar="ID")
     common = shared("--env-kwargs", "--gym-packages", "--model", "--json")
     return OneLineParser(words, EPILOG, {"": [told, *common]})
 
@@ -34,6 +35,7 @@ def main() -> int:
     """Print the optimum."""
     args = build_parser().parse_args()
     cli.import_typed(args)
+    cli.register_typed(args)
     from rl_yardstick.commands.terminal import say, table_console
     from rl_yardstick.pipeline.files import write_json
     from rl_yardstick.pipeline.settings import parse_assignments

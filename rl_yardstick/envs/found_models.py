@@ -142,7 +142,8 @@ def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
         found = model_of(env, seconds=limits.seconds, max_states=limits.states, progress=progress)
     except NotFinite as error:
         if isinstance(error, Unfinished):
-            return NotFound(f"{error}; --model {10 * limits.states} to go on", ends_at_limit=True)
+            more = f"--model {10 * limits.states} to continue"
+            return NotFound(f"{error}; {more}", ends_at_limit=True)
         return NotFound(str(error))
     model, observations = _legal(found), _stacked(env.observation_space, found)
     notes = tuple(found.notes)

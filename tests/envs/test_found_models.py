@@ -156,7 +156,7 @@ def test_other_code_of_the_same_name_is_searched_anew(monkeypatch, tmp_path):
     ("kind", "words"),
     [
         ("none", "the model of Walk-v0 is not known$"),
-        ("3", "more than 3 states.*; --model 30 to go on$"),
+        ("3", "more than 3 states.*; --model 30 to continue$"),
     ],
 )
 def test_limits(kind, words):
