@@ -132,7 +132,8 @@ def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
 
     def progress(n_states: int, _n_done: int) -> None:
         nonlocal is_said
-        if time.perf_counter() - begin > SAID_AFTER and not is_said:
+        is_late = time.perf_counter() - begin > SAID_AFTER
+        if is_late and not is_said and sys.stderr.isatty():
             is_said = True
             most = f"at most {limits.states:,} states"
             most += "" if math.isinf(limits.seconds) else f", {limits.seconds:g} seconds"

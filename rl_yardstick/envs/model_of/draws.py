@@ -250,5 +250,5 @@ def scripted(script: Script, holders: Iterable[Any]) -> Iterator[None]:
     try:
         yield
     finally:
-        for held, key, value in replaced:
+        for held, key, value in reversed(replaced):  # one may be held twice
             held[key] = value
