@@ -37,6 +37,7 @@ class Script:
 
     def __init__(self) -> None:
         self.time, self.until = 0, NEVER  # what a run does at this time holds until then
+        self.level = 0.5  # the quantile, of what is known, at which a continuous number is a float
         self.begin([], 0, {})
 
     def begin(self, choices: list[int], root: int, loops: dict[Any, bool]) -> None:
@@ -45,9 +46,7 @@ class Script:
         self.trace: list[tuple[int, list[float]]] = []
         self.chance = 1.0
         self.visits: dict[Any, int] = {}
-        # Continuous numbers that were turned into floats, at this quantile of what is known.
-        self.floats: list[Drawn] = []
-        self.level = 0.5
+        self.floats: list[Drawn] = []  # continuous numbers that were turned into floats
 
     def branch(self, chances: int | Sequence[float]) -> int:
         """The number of the branch to take, of so many equal ones or of ones with these weights."""
@@ -86,7 +85,7 @@ class Script:
 
 def take_step(env: gym.Env[Any, Any], action: Any) -> tuple[Any, ...]:
     """One step, or the reset if the action is None; here the stack of a script ends."""
-    return env.reset() if action is None else env.step(action)
+    return (env.reset()[0], 0.0, False, False) if action is None else env.step(action)[:4]
 
 
 # The law, its parameters (scale and shift of a continuous one) and the size, from the arguments.
@@ -147,6 +146,9 @@ class NumpyDraws:
     def _each(self, draw: Callable[..., Any], size: Any, *given: Any, dtype: Any = object) -> Any:
         """One draw, or an array of draws, with parameters that may be arrays."""
         self._script.visit()
+        if size is None and not any(map(np.ndim, given)):
+            value = draw(*given)
+            return np.int64(value) if dtype is int else value
         shape = np.broadcast_shapes(*map(np.shape, given)) if size is None else np.empty(size).shape
         flat = [np.broadcast_to(x, shape).ravel().tolist() for x in given]
         drawn = np.empty(math.prod(shape), object)
