@@ -9,7 +9,8 @@ shared out among the other outcomes, which is exact.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Hashable
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -38,15 +39,15 @@ class Outcome(NamedTuple):
 
 Chances = dict[Any, float]  # of outcomes
 Spans = list[tuple[int, Chances]]  # what an action does from a time on, until the next entry
-Run = Callable[[list[int], int, dict[Any, bool]], Outcome]
 
 
+@dataclass
 class Tree:
     """The tree of draws below one action in one state."""
 
-    def __init__(self, run: Run, script: Script) -> None:
-        self.run, self.script = run, script
-        self.loops: dict[Any, bool] = {}
+    run: Callable[[list[int], int, dict[Any, bool]], Outcome]
+    script: Script
+    loops: dict[Any, bool] = field(default_factory=dict)
 
     def outcomes(self) -> Chances:
         """The probability of each outcome."""
@@ -123,6 +124,8 @@ class Search:
     seconds: float
     max_states: int
     progress: Callable[[int, int], None] | None = None
+    seeds: Sequence[int] = ()  # of the resets to start from; none for all resets
+    put: Callable[[bool], Any] = bool  # lets draws follow the script, or not
     started: float = field(default_factory=perf_counter)
 
     def run(self) -> tuple[TransitionModel, Bools]:
@@ -130,10 +133,7 @@ class Search:
         while True:
             self.state.guess()
             try:
-                try:
-                    self._search()
-                finally:
-                    self.state.check_constants()
+                self._search()
                 return self._model()
             except Refuted as refuted:
                 self.state.used.add(refuted.args[0])
@@ -146,32 +146,47 @@ class Search:
         self.illegal: dict[str, int] = {}
         self.end = NEVER - 1  # the time of the last step of the longest episode
         self.runs = 0
-        self.state.script.time = 0
-        self.initial = self._outcomes(self.state.save(self.state.variables()), None)
+        self.initial = self._starts(self.state.save(self.state.variables()))
         while len(self.rows) < len(self.saved):
             if not any(row := [self._spans(len(self.rows), action) for action in self.actions]):
                 raise Stop(f"every action fails in a state: {next(iter(self.illegal))}")
             self.rows.append(row)
-            if len(self.rows) == 20:
-                lengths = [len(spans) for row in self.rows for spans in row]
-                if sum(n > 3 for n in lengths) > len(lengths) / 2:
-                    self._time_is_state()
-        self.state.script.time = 0
-        for outcome in self._outcomes(self.saved[-1], None):  # a reset forgets all
+            often = len(self.rows) == 20 and [len(spans) > 3 for row in self.rows for spans in row]
+            if often and np.mean(often) > 0.5:  # time matters all along
+                raise Refuted(next(iter(self.state.clocks)))
+        self.state.check_constants()
+        for outcome in self._starts(self.saved[-1]):  # a reset forgets all
             if outcome not in self.initial:
                 self.refuse_start(self.state.saved(self.saved[outcome.state]))
 
-    def _time_is_state(self) -> None:
-        raise Refuted(next(iter(self.state.clocks)))
+    def _starts(self, saved: bytes) -> Chances:
+        """The chances of what a reset leads to; with seeds, each is as likely."""
+        self.state.script.time = 0
+        if not self.seeds:
+            return self._outcomes(saved, None)
+        chances: Chances = defaultdict(float)
+        for seed in self.seeds:
+            self.state.restore(saved)
+            self.put(False)
+            observation, _ = self.state.layers[0].reset(seed=seed)
+            self.put(True)
+            chances[Outcome(self._number(observation, is_reset=True), 0.0)] += 1 / len(self.seeds)
+        return dict(chances)
 
     def refuse_start(self, variables: Saved) -> None:
         """Name the attribute that no start of an episode has."""
-        starts = [self.state.saved(self.saved[outcome.state]) for outcome in self.initial]
-        for i, own in enumerate(variables):
+        starts = self._values([self.saved[outcome.state] for outcome in self.initial])
+        for name, value in (pair for own in variables for pair in own.items()):
+            if self.state.by_value(value) not in starts[name]:
+                raise Stop(f"`{name}` is kept over `reset` (ignore it if it changes nothing)")
+
+    def _values(self, sample: list[bytes]) -> dict[str, set[Hashable]]:
+        """The values that each attribute has in these states."""
+        values: dict[str, set[Hashable]] = defaultdict(set)
+        for own in (own for saved in sample for own in self.state.saved(saved)):
             for name, value in own.items():
-                known = {self.state.by_value(start[i].get(name)) for start in starts}
-                if self.state.by_value(value) not in known:
-                    raise Stop(f"`{name}` is kept over `reset` (ignore it if it changes nothing)")
+                values[name].add(self.state.by_value(value))
+        return values
 
     def _spans(self, state: int, action: Any) -> Spans:
         """What the action does at each time; empty where it is not allowed."""
@@ -193,7 +208,7 @@ class Search:
                 if any(outcome.truncated for outcome in chances):
                     self.end = min(self.end, time)
             elif time and (time == self.end or (len(spans) > MOST_SPANS and self.end > NEVER - 2)):
-                self._time_is_state()
+                raise Refuted(next(iter(self.state.clocks)))
             script.time = script.until + 1
         return spans
 
@@ -214,18 +229,23 @@ class Search:
         if isinstance(reward, np.ndarray):
             reward = reward.item()
         moments = reward.moments() if isinstance(reward, Drawn) else (float(reward), 0.0)
-        variables = state.variables()
         if terminated or truncated:
+            state.variables()
             return Outcome(-1, *moments, bool(terminated), bool(truncated))
-        state.check_clocks(is_reset=action is None)
-        key = state.key(variables), state.by_value(observation)
+        return Outcome(self._number(observation, is_reset=action is None), *moments)
+
+    def _number(self, observation: Any, is_reset: bool) -> int:
+        """The number of the state that the environment is in; a new one gets the next."""
+        self.state.check_clocks(is_reset)
+        variables = self.state.variables()
+        key = self.state.key(variables), self.state.by_value(observation)
         number = self.index.setdefault(key, len(self.index))
         if number == len(self.saved):
             if number >= self.max_states:
-                raise Stop(f"more than {self.max_states:,} states{self._growing()}")
-            self.saved.append(state.save(variables))
+                raise Stop(f"more than {self.max_states:,} states; {self._growing()}")
+            self.saved.append(self.state.save(variables))
             self.observations.append(copy.deepcopy(observation))
-        return Outcome(number, *moments)
+        return number
 
     def _linear(self, outcome: Outcome, saved: bytes, action: Any) -> Outcome:
         """The outcome of a run that made a float of a continuous number.
@@ -252,24 +272,21 @@ class Search:
         """Watch the time, and now and then the constants."""
         self.runs += 1
         if perf_counter() - self.started > self.seconds:
-            done = f"{len(self.saved):,} states found, {len(self.rows):,} of them done"
-            if not self.rows:
-                done = f"`reset` has more than {len(self.saved):,} outcomes"
-            raise Stop(f"no end after {self.seconds:g} seconds: {done}{self._growing()}")
+            done = f"{len(self.saved):,} states found, {len(self.rows):,} of them done; "
+            done = done * bool(self.rows) + self._growing()
+            raise Stop(f"no end after {self.seconds:g} seconds: {done}")
         if self.runs & (self.runs - 1) == 0:
             self.state.check_constants()
         if self.progress is not None and self.runs % 256 == 0:
             self.progress(len(self.saved), len(self.rows))
 
     def _growing(self) -> str:
-        """The attribute that takes most values, as a hint."""
-        values: dict[str, set[Hashable]] = {}
-        sample = self.saved[:: max(1, len(self.saved) // 500)]
-        for own in (own for saved in sample for own in self.state.saved(saved)):
-            for name, value in own.items():
-                values.setdefault(name, set()).add(self.state.by_value(value))
-        name = max(values, key=lambda name: len(values[name]), default="")
-        return f"; `{name}` has {len(values[name])} values in {len(sample)} of them" if name else ""
+        """What there is most of: outcomes of the reset, or values of an attribute."""
+        if not self.rows:
+            return f"`reset` has more than {self.runs:,} outcomes (--starts 0 1 2 takes three)"
+        values = self._values(sample := self.saved[:: max(1, len(self.saved) // 500)])
+        name = max(values, key=lambda name: len(values[name]))
+        return f"`{name}` has {len(values[name])} values in {len(sample)} of them"
 
     def state_now(self, observation: Any, time: int) -> int | None:
         """The number in the model of the state that the environment is in; None if unknown."""
@@ -292,7 +309,7 @@ class Search:
         for (_, usual), *later in (spans for row in self.rows for spans in row if spans):
             if any(first < self.end or not _alike(usual, chances) for first, chances in later):
                 if self.horizon is None:
-                    self._time_is_state()
+                    raise Refuted(next(iter(self.state.clocks)))
                 return self.end + 1
         return 1
 
@@ -313,7 +330,7 @@ class Search:
             raise Stop(f"a model of {n:,} states at {self.times:,} times is too large")
         table = np.zeros((5, *shape))  # probability, reward, variance, end, next state
         table[0, ..., 0] = table[3] = 1.0  # of actions that are not allowed
-        for time in range(self.times) if self.times > 1 else [0]:
+        for time in range(self.times):
             at = first == time
             table[:, time:, s[at], a[at]] = 0.0
             table[:, time:, s[at], a[at], k[at]] = columns[4:, None, at]

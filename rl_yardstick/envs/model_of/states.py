@@ -16,7 +16,6 @@ import enum
 import io
 import pickle
 import types
-from collections import deque
 from collections.abc import Hashable, Iterable
 from typing import Any
 
@@ -36,7 +35,6 @@ NO_STATE = {"_cached_spec", "_np_random_seed", "action_space", "env", "metadata"
 NO_STATE |= {"observation_space", "render_mode", "spec"}
 PLAYED = 50  # steps of each of the two episodes that are played first
 SIMPLE = (int, float, str, bytes, complex, types.NoneType, np.generic)
-ATOMS = frozenset({int, float, str, bool, bytes, complex, type(None)})
 BY_IDENTITY: tuple[Any, ...] = (types.FunctionType, types.BuiltinFunctionType, types.ModuleType)
 BY_IDENTITY += (type, np.dtype, np.ufunc, gym.Space, enum.Enum, gym.Env, *GENERATORS)
 
@@ -48,19 +46,16 @@ class Refuted(BaseException):
 class Ghost(Symbol):
     """Something that nobody reads: numbers and items may be added to it, the rest raises."""
 
-    def now(self) -> Any:
+    def now(self, *given: Any) -> Any:
         raise self.known
+
+    __getattr__ = __len__ = __getitem__ = __setitem__ = __iter__ = __contains__ = now
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **keywords: Any) -> Any:
         return self if ufunc in (np.add, np.subtract, np.multiply) else self.now()
 
     def append(self, item: Any) -> None:
         """Nobody reads what is appended."""
-
-    def _used(self, *given: Any) -> Any:
-        self.now()
-
-    __getattr__ = __len__ = __getitem__ = __setitem__ = __iter__ = __contains__ = _used
 
 
 class Clock(Symbol):
@@ -88,26 +83,19 @@ class ByValue(pickle.Pickler):
 
     def persistent_id(self, value: Any) -> Any:
         kind, i = type(value), id(value)
-        if kind in ATOMS:
-            return value
-        if kind is tuple:
-            return None
-        if isinstance(value, np.generic):
-            return value.item()
+        if isinstance(value, SIMPLE):
+            return value.item() if isinstance(value, np.generic) else value
         if isinstance(value, Symbol):
             return value.now()
         if i in self.seen:
             return "again", self.seen[i][0]
-        self.seen[i] = len(self.seen), value
+        if kind is not tuple:
+            self.seen[i] = len(self.seen), value
         if kind is np.ndarray and value.dtype != object:
             return value.dtype.char, value.shape, value.tobytes()
-        if isinstance(value, GENERATORS):
-            return "generator"
         if self.reference(value) is not None:
-            return "object", i
-        if kind in (set, frozenset):
-            return "set", *sorted(map(repr, value))
-        return None
+            return "generator" if isinstance(value, GENERATORS) else ("object", i)
+        return ("set", *sorted(value, key=hash)) if kind in (set, frozenset) else None
 
     def reducer_override(self, value: Any) -> Any:
         try:
@@ -159,9 +147,14 @@ class State:
         """See in a short play which attributes nothing changes, and which count the steps."""
         env, rng = self.layers[0], np.random.default_rng(0)
         counts, values = [], []
+
+        def note() -> None:
+            now = self.attributes().items()
+            values.append({(place, self.by_value(value)) for place, value in now})
+
         for seed in (0, 1, 0):
             env.reset(seed=seed)
-            values.append({(p, self.by_value(value)) for p, value in self.attributes().items()})
+            note()
             for step in range(PLAYED):
                 now = self.attributes().items()
                 counts.append({(p, value - step) for p, value in now if type(value) is int})
@@ -170,7 +163,7 @@ class State:
                         break
                 except Exception:  # noqa: BLE001 (a step that is not allowed ends the episode)
                     break
-            values.append({(p, self.by_value(value)) for p, value in self.attributes().items()})
+            note()
         env.reset(seed=0)
         self.layers[-1].np_random  # noqa: B018 (makes it)
         self.counting = dict(set.intersection(*counts))
@@ -182,18 +175,19 @@ class State:
         for (layer, kind, _), held in zip(self.original, self.start, strict=True):
             layer.__class__ = kind
             vars(layer).update((k, v) for k, v in held.items() if not isinstance(v, GENERATORS))
-        values = {p: value for p, value in self.attributes().items() if p not in self.used}
-        self.constants = {p: self.left_alone[p] for p in values if p in self.left_alone}
-        self.kept = parts_of([values[place] for place in self.constants])
+        guessed = {p: value for p, value in self.attributes().items() if p not in self.used}
+        self.constants = {p: self.left_alone[p] for p in guessed if p in self.left_alone}
+        self.kept = self.parts([guessed[place] for place in self.constants])
         self.kept |= {id(layer): layer for layer in self.layers}
-        rest = values.keys() - self.constants.keys()
-        self.clocks = {p: self.counting[p] for p in rest if p in self.counting}
+        self.watched = {p: value for p, value in guessed.items() if p not in self.constants}
+        self.clocks = {p: self.counting[p] for p in self.watched if p in self.counting}
         self.fixed = []
         for i, layer in enumerate(self.layers):
-            draws = [name for name, value in vars(layer).items() if isinstance(value, GENERATORS)]
-            constant = {name: values[j, name] for j, name in self.constants if j == i}
-            names = {place[1]: self._property(place) for place in rest if place[0] == i}
-            self.fixed.append(dict.fromkeys([*self.no_state, *draws, *names]) | constant)
+            fixed = {k: v for k, v in vars(layer).items() if (i, k) not in self.used}
+            self.fixed.append(dict.fromkeys(self.no_state) | fixed)
+            names = {name: self._property((j, name)) for j, name in self.watched if i == j}
+            for name in names:
+                del vars(layer)[name]
             kind = type(layer)
             layer.__class__ = type(kind.__name__, (kind,), {"__module__": kind.__module__} | names)
 
@@ -208,20 +202,15 @@ class State:
                 return Ghost(self.script, Refuted(place))
             raise Refuted(place)
 
-        def write(_: Env, value: Any) -> None:
-            self.watched[place] = value
-
-        self.watched[place] = vars(self.layers[place[0]]).pop(place[1])
-        return property(read, write)
+        return property(read, lambda _, value: self.watched.update({place: value}))
 
     def check_clocks(self, is_reset: bool) -> None:
         """Every clock must have counted the step, or start anew."""
         for place, start in self.clocks.items():
             value = self.watched[place]
-            if is_reset or not isinstance(value, Clock):
-                right = is_reset and type(value) is int and value == start
-            else:
-                right = (value.scale, value.shift) == (1, start + 1)
+            right = type(value) is int and value == start
+            if not is_reset:
+                right = isinstance(value, Clock) and (value.scale, value.shift) == (1, start + 1)
             if not right:
                 raise Refuted(place)
 
@@ -298,30 +287,17 @@ class State:
 
     def by_value(self, value: Any) -> Hashable:
         """Something hashable that is equal for equal values."""
-        if type(value) in ATOMS:
-            return value  # type: ignore[no-any-return]
-        if isinstance(value, np.generic):
-            return value.item()  # type: ignore[no-any-return]
+        if isinstance(value, SIMPLE):
+            return value
         if type(value) is np.ndarray and value.dtype != object:
             return value.dtype.char, value.shape, value.tobytes()
         file = io.BytesIO()
         ByValue(file, self).dump(value)
         return file.getvalue()
 
-
-def parts_of(values: list[Any]) -> dict[int, Any]:
-    """The values and all objects that they hold, by id."""
-    found: dict[int, Any] = {}
-    todo = list(values)
-    while todo:
-        value = todo.pop()
-        if id(value) in found or type(value) in ATOMS or isinstance(value, BY_IDENTITY):
-            continue
-        found[id(value)] = value
-        parts: Iterable[Any] = getattr(value, "__dict__", {}).values()
-        if isinstance(value, dict | list | tuple | set | deque):
-            parts = value.values() if isinstance(value, dict) else value
-        elif isinstance(value, np.ndarray) and value.dtype == object:
-            parts = value.ravel().tolist()
-        todo.extend(parts)
-    return found
+    def parts(self, value: Any) -> dict[int, Any]:
+        """The objects that a value is made of, by id."""
+        self.kept = {}
+        pickler = ByValue(io.BytesIO(), self)
+        pickler.dump(value)
+        return {i: part for i, (_, part) in pickler.seen.items()}
