@@ -146,6 +146,7 @@ class Search:
         self.illegal: dict[str, int] = {}
         self.end = NEVER - 1  # the time of the last step of the longest episode
         self.runs = 0
+        self.initial: Chances = {}
         self.initial = self._starts(self.state.save(self.state.variables()))
         while len(self.rows) < len(self.saved):
             if not any(row := [self._spans(len(self.rows), action) for action in self.actions]):
@@ -281,11 +282,13 @@ class Search:
             self.progress(len(self.saved), len(self.rows))
 
     def _growing(self) -> str:
-        """What there is most of: outcomes of the reset, or values of an attribute."""
+        """What there is most of: outcomes, or values of an attribute."""
         if not self.rows:
-            return f"`reset` has more than {self.runs:,} outcomes (--starts 0 1 2 takes three)"
+            what = "a step" if self.initial else "`reset`"
+            hint = "" if self.initial else " (--starts 0 1 2 takes three)"
+            return f"{what} has more than {self.runs:,} outcomes{hint}"
         values = self._values(sample := self.saved[:: max(1, len(self.saved) // 500)])
-        name = max(values, key=lambda name: len(values[name]))
+        name = max(values, key=lambda name: len(values[name]), default="state")
         return f"`{name}` has {len(values[name])} values in {len(sample)} of them"
 
     def state_now(self, observation: Any, time: int) -> int | None:
