@@ -35,6 +35,8 @@ NO_STATE = {"_cached_spec", "_np_random_seed", "action_space", "env", "metadata"
 NO_STATE |= {"observation_space", "render_mode", "spec"}
 PLAYED = 50  # steps of each of the two episodes that are played first
 SIMPLE = (int, float, str, bytes, complex, types.NoneType, np.generic)
+ATOMS = frozenset({*SIMPLE, bool})
+NUMBERS = (np.generic, Symbol)
 BY_IDENTITY: tuple[Any, ...] = (types.FunctionType, types.BuiltinFunctionType, types.ModuleType)
 BY_IDENTITY += (type, np.dtype, np.ufunc, gym.Space, enum.Enum, gym.Env, *GENERATORS)
 
@@ -83,14 +85,15 @@ class ByValue(pickle.Pickler):
 
     def persistent_id(self, value: Any) -> Any:
         kind, i = type(value), id(value)
-        if isinstance(value, SIMPLE):
-            return value.item() if isinstance(value, np.generic) else value
-        if isinstance(value, Symbol):
-            return value.now()
+        if kind in ATOMS:
+            return value
+        if kind is tuple:
+            return None
         if i in self.seen:
             return "again", self.seen[i][0]
-        if kind is not tuple:
-            self.seen[i] = len(self.seen), value
+        if isinstance(value, NUMBERS):
+            return value.now() if isinstance(value, Symbol) else value.item()
+        self.seen[i] = len(self.seen), value
         if kind is np.ndarray and value.dtype != object:
             return value.dtype.char, value.shape, value.tobytes()
         if self.reference(value) is not None:
@@ -264,9 +267,11 @@ class State:
 
     def reference(self, value: Any) -> int | None:
         """The number of an object that is not saved, as it stays the same."""
-        if isinstance(value, BY_IDENTITY):
+        if id(value) not in self.kept:
+            if type(value) in ATOMS or not isinstance(value, BY_IDENTITY):
+                return None
             self.kept[id(value)] = value
-        return id(value) if id(value) in self.kept else None
+        return id(value)
 
     def saved(self, saved: bytes) -> Saved:
         """The attributes of a saved state."""
