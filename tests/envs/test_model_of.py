@@ -2,6 +2,8 @@
 
 import random
 import re
+import sys
+import types
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -304,15 +306,16 @@ REFUSALS: dict[str, tuple[Callable[..., Any], str]] = {
     "not saved": (unpicklable, r"`stream` cannot be saved: cannot pickle 'generator' object"),
     "orders": (shuffled, r"test_model_of.py:\d+ shuffles 52 things: too many orders"),
     "outside": (hidden, r"something outside its attributes decides .*: state 0, action "),
-    "no end": (endless, r"no end after 2 seconds: `reset` has more than"),
+    "no end": (endless, r"no end after 2 seconds: a step has more than \d+,?\d* outcomes"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSALS)
 def test_refusals(name: str) -> None:
     rule, message = REFUSALS[name]
+    seconds, most = (2.0, 10**6) if name == "no end" else (100.0, 1000)
     with pytest.raises(NotFinite, match=message):
-        model_of(World(rule), seconds=2.0, max_states=1000 if "states" in name else 10**6)
+        model_of(World(rule), seconds=seconds, max_states=most)
 
 
 class Record(World):
@@ -330,6 +333,37 @@ def test_what_is_kept_over_the_reset_is_named() -> None:
     env.best = 0
     with pytest.raises(NotFinite, match="`best` is kept over `reset`"):
         model_of(env, **PATIENT)
+
+
+class Deal(World):
+    """A reset deals nine cards; a step plays one, which is right or wrong by chance."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.hand = self.np_random.integers(0, 30, size=9).tolist()
+        return self.hand[-1], {}
+
+    def step(self, action: int) -> Any:
+        card = self.hand.pop()
+        right = bool(self.np_random.random() < (0.8 if (card < 15) == (action == 0) else 0.2))
+        return self.hand[-1] if self.hand else 30, float(right), not self.hand, False, {}
+
+
+def test_seeds_of_resets() -> None:
+    """Each seed gives a start; steps stay random. Playing each card well is right in 0.8."""
+    with pytest.raises(NotFinite, match=r"`reset` has more than .* outcomes \(--starts 0 1 2"):
+        model_of(Deal(climb), seconds=1.0)
+    found = model_of(Deal(climb), starts=[0, 1, 2], **PATIENT)
+    assert found.model.initial[found.model.initial > 0] == pytest.approx([1 / 3] * 3)
+    assert optimum(found, 9) == pytest.approx(9 * 0.8)
+
+
+def test_a_helper_module_that_imports_a_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    dice: Any = types.ModuleType(f"{__name__}.dice")
+    dice.choice = random.choice
+    monkeypatch.setitem(sys.modules, dice.__name__, dice)
+    found = model_of(World(lambda *_: (float(dice.choice([1, 1, 4])), True, False)), **PATIENT)
+    assert found.model.expected_reward[0] == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("shift", [0.1, -0.1])

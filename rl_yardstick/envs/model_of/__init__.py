@@ -14,6 +14,7 @@ import itertools
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -24,7 +25,7 @@ from gymnasium import spaces
 from rl_yardstick.envs.model_of.check import refutation
 from rl_yardstick.envs.model_of.draws import Script, scripted
 from rl_yardstick.envs.model_of.search import Search
-from rl_yardstick.envs.model_of.states import State, parts_of
+from rl_yardstick.envs.model_of.states import State
 from rl_yardstick.envs.model_of.symbols import Limit, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
@@ -64,6 +65,7 @@ def model_of(
     max_states: int = 100_000,
     ignore: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
+    starts: Sequence[int] | None = None,
 ) -> FoundModel:
     """The exact model of a finite environment, found by running its `reset` and `step`.
 
@@ -74,27 +76,29 @@ def model_of(
         max_states: the number of states above which it gives up.
         ignore: names of attributes that change nothing.
         progress: called now and then with the number of states found, and of those done.
+        starts: seeds of `reset`; episodes start from the states that these lead to, each as likely.
+            None for all states that a reset can lead to.
 
     Raises:
         NotFinite: if there is no finite model, or the environment does not follow the one found.
     """
     actions = _actions_of(env.action_space)
     state = State(env, Script(), ignore)
-    search = Search(state, actions, seconds, max_states, progress)
-    modules = {kind.__module__ for layer in state.layers for kind in type(layer).__mro__}
+    search = Search(state, actions, seconds, max_states, progress, starts or ())
     try:
         state.restore_original(without_transparent=True)
         state.play(actions)
-        held = list(parts_of([vars(layer) for layer in state.layers]).values())
-        held += [sys.modules[name] for name in modules]
+        held = list(state.parts([vars(layer) for layer in state.layers]).values())
+        held += _modules(state.layers)
         for layer in state.layers:
             layer.action_space.np_random  # noqa: B018 (makes its generator)
             held.append(layer.action_space)
-        with scripted(state.script, held):
+        with scripted(state.script, held) as search.put:
             model, mask = search.run()
         state.restore_original(without_transparent=True)
         allowed = None if mask.all() else mask
-        if problem := refutation(state.layers[0], model, search.state_now, actions, allowed):
+        tested = _Seeded(state.layers[0], starts) if starts else state.layers[0]
+        if problem := refutation(tested, model, search.state_now, actions, allowed):
             raise NotFinite(f"{OUTSIDE}: {problem}")
     except Stop as stop:
         kind = Unfinished if isinstance(stop, Limit) else NotFinite
@@ -112,6 +116,30 @@ def model_of(
         notes.append(f"{pairs:,} pairs of state and action are not allowed: {error}")
     observations, spent = search.observations * search.times, perf_counter() - search.started
     return FoundModel(model, allowed, observations, actions, search.horizon, notes, spent)
+
+
+class _Seeded(gym.Wrapper[Any, Any, Any, Any]):
+    """Starts from these seeds in turn; what follows is random."""
+
+    def __init__(self, env: gym.Env[Any, Any], seeds: Sequence[int]) -> None:
+        super().__init__(env)
+        self.seeds, self.rng = itertools.cycle(seeds), np.random.default_rng(0)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        result = self.env.reset(seed=next(self.seeds))
+        self.env.unwrapped.np_random = self.rng
+        return result
+
+
+def _modules(layers: list[gym.Env[Any, Any]]) -> list[Any]:
+    """The modules of the environment's classes, and all of their packages and folders."""
+    kinds = [kind for layer in layers for kind in type(layer).__mro__ if issubclass(kind, gym.Env)]
+    places = {
+        name: {name.partition(".")[0], Path(getattr(module, "__file__", None) or name).parent}
+        for name, module in list(sys.modules.items())
+    }
+    near = set().union(*(places[kind.__module__] for kind in kinds)) - {Path()}
+    return [sys.modules[name] for name, place in places.items() if place & near]
 
 
 def _actions_of(space: gym.Space[Any]) -> list[Any]:

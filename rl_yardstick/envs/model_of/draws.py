@@ -37,6 +37,7 @@ class Script:
 
     def __init__(self) -> None:
         self.time, self.until = 0, NEVER  # what a run does at this time holds until then
+        self.level = 0.5  # the quantile, of what is known, at which a continuous number is a float
         self.begin([], 0, {})
 
     def begin(self, choices: list[int], root: int, loops: dict[Any, bool]) -> None:
@@ -45,9 +46,7 @@ class Script:
         self.trace: list[tuple[int, list[float]]] = []
         self.chance = 1.0
         self.visits: dict[Any, int] = {}
-        # Continuous numbers that were turned into floats, at this quantile of what is known.
-        self.floats: list[Drawn] = []
-        self.level = 0.5
+        self.floats: list[Drawn] = []  # continuous numbers that were turned into floats
 
     def branch(self, chances: int | Sequence[float]) -> int:
         """The number of the branch to take, of so many equal ones or of ones with these weights."""
@@ -68,41 +67,38 @@ class Script:
 
     def visit(self) -> None:
         """Note the place in the code that draws, to find loops that draw until they like it."""
-        depth, place, frame = len(self.trace), [], sys._getframe(1)
-        while frame.f_code is not take_step.__code__:
+        depth, frame = len(self.trace), sys._getframe(1)
+        place: tuple[Any, ...] = ()
+        while frame.f_code is not take_step.__code__ and frame.f_back:
             if frame.f_code.co_filename != __file__:
-                place.append((frame.f_code, frame.f_lasti))
-            assert frame.f_back is not None
+                place = (*place, frame.f_code, frame.f_lasti)
             frame = frame.f_back
-        key = tuple(place)
-        if depth >= self.root and (first := self.visits.setdefault(key, depth)) < depth:
-            starts_again = self.loops.get(key)
-            if starts_again is None:
-                raise Suspect(key, first, [choice for choice, _ in self.trace])
+        if depth >= self.root and (first := self.visits.setdefault(place, depth)) < depth:
+            if (starts_again := self.loops.get(place)) is None:
+                raise Suspect(place, first, [choice for choice, _ in self.trace])
             if starts_again:
                 raise Again(first)
-            self.visits[key] = depth
+            self.visits[place] = depth
 
 
 def take_step(env: gym.Env[Any, Any], action: Any) -> tuple[Any, ...]:
     """One step, or the reset if the action is None; here the stack of a script ends."""
-    return env.reset() if action is None else env.step(action)
+    return (env.reset()[0], 0.0, False, False) if action is None else env.step(action)[:4]
 
 
 # The law, its parameters (scale and shift of a continuous one) and the size, from the arguments.
 LAWS: dict[str, Callable[..., tuple[Any, ...]]] = {
     "random": lambda size=None, dtype=None: (UNIFORM, 1.0, 0.0, size),
-    "random_sample": lambda size=None: (UNIFORM, 1.0, 0.0, size),
     "rand": lambda *shape: (UNIFORM, 1.0, 0.0, shape or None),
     "uniform": lambda low=0.0, high=1.0, size=None: (UNIFORM, np.subtract(high, low), low, size),
     "normal": lambda loc=0.0, scale=1.0, size=None: (NORMAL, scale, loc, size),
-    "gauss": lambda mu=0.0, sigma=1.0: (NORMAL, sigma, mu, None),
     "standard_normal": lambda size=None: (NORMAL, 1.0, 0.0, size),
     "randn": lambda *shape: (NORMAL, 1.0, 0.0, shape or None),
     "binomial": lambda n, p, size=None: ("binom", n, p, size),
     "poisson": lambda lam=1.0, size=None: ("poisson", lam, size),
     "geometric": lambda p, size=None: ("geom", p, size),
 }
+LAWS |= {"random_sample": LAWS["random"], "gauss": LAWS["normal"], "normalvariate": LAWS["normal"]}
 
 
 @functools.cache
@@ -144,9 +140,12 @@ class NumpyDraws:
 
         return self._each(draw, size, *parameters, dtype=int if isinstance(law, str) else object)
 
-    def _each(self, draw: Callable[..., Any], size: Any, *given: Any, dtype: Any = object) -> Any:
+    def _each(self, draw: Callable[..., Any], size: Any, *given: Any, dtype: Any = int) -> Any:
         """One draw, or an array of draws, with parameters that may be arrays."""
         self._script.visit()
+        if size is None and not any(map(np.ndim, given)):
+            value = draw(*given)
+            return np.int64(value) if dtype is int else value
         shape = np.broadcast_shapes(*map(np.shape, given)) if size is None else np.empty(size).shape
         flat = [np.broadcast_to(x, shape).ravel().tolist() for x in given]
         drawn = np.empty(math.prod(shape), object)
@@ -186,8 +185,7 @@ class NumpyDraws:
         weights = None if p is None else [float(x) for x in p]
         if replace or size is None:
             draw = self._script.branch
-            indices = self._each(lambda _: draw(weights or len(pool)), size, 0, dtype=int)
-            return pool[indices]
+            return pool[self._each(lambda _: draw(weights or len(pool)), size, 0)]
         indices = self._in_order(int(np.prod(size)), len(pool), weights)
         return pool[indices].reshape(np.empty(size).shape + pool.shape[1:])
 
@@ -203,9 +201,8 @@ class NumpyDraws:
 class PythonDraws(NumpyDraws):
     """The methods of Python's `random.Random`, drawn by a script."""
 
-    def randrange(self, start: int, stop: int | None = None, step: int = 1) -> int:
-        values = range(start) if stop is None else range(start, stop, step)
-        return values[int(self.integers(len(values)))]
+    def randrange(self, *bounds: int) -> int:
+        return range(*bounds)[int(self.integers(len(range(*bounds))))]
 
     def randint(self, a: int, b: int) -> int:  # type: ignore[override]
         return self.randrange(a, b + 1)
@@ -227,28 +224,33 @@ NOT_REPLACED = {"_inst", "_rand", "getstate", "setstate", "get_state", "set_stat
 
 
 @contextmanager
-def scripted(script: Script, holders: Iterable[Any]) -> Iterator[None]:
+def scripted(script: Script, holders: Iterable[Any]) -> Iterator[Callable[[bool], None]]:
     """Let generators that the holders hold follow the script, and `random` and `numpy.random`.
 
     A holder is a list, or an object or module with attributes; functions of `random` and
-    `numpy.random` that it holds by name follow the script, too.
+    `numpy.random` that it holds by name follow the script, too. The function given puts them all in
+    their places, or the real ones.
     """
     python, numpy_ = PythonDraws(script), NumpyDraws(script)
     shared = [np.random.mtrand._rand, random._inst]
     replaced = []
     for holder in [random, np.random, *holders]:
         held: Any = holder if isinstance(holder, dict | list) else getattr(holder, "__dict__", {})
-        for key in list(held) if isinstance(held, dict) else range(len(held)):
-            value = held[key]
+        for key, value in list(held.items() if isinstance(held, dict) else enumerate(held)):
             owner = value if isinstance(value, GENERATORS) else getattr(value, "__self__", None)
-            if not isinstance(owner, GENERATORS) or key in NOT_REPLACED:
+            if key in NOT_REPLACED or not isinstance(owner, GENERATORS):
                 continue
-            draws = python if isinstance(owner, random.Random) else numpy_
             if value is owner or any(owner is known for known in shared):
-                replaced.append((held, key, value))
-                held[key] = draws if value is owner else getattr(draws, value.__name__)
+                draws = python if isinstance(owner, random.Random) else numpy_
+                new = draws if value is owner else getattr(draws, value.__name__)
+                replaced.append((held, key, (value, new)))
+
+    def put(is_scripted: bool) -> None:
+        for held, key, values in replaced:
+            held[key] = values[is_scripted]
+
+    put(True)
     try:
-        yield
+        yield put
     finally:
-        for held, key, value in reversed(replaced):  # one may be held twice
-            held[key] = value
+        put(False)

@@ -9,7 +9,8 @@ shared out among the other outcomes, which is exact.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Hashable
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -25,8 +26,6 @@ MOST_ENTRIES = 100_000_000  # of the arrays of a model
 MOST_SPANS = 1000  # times at which one action can do different things, if episodes have no end
 LEVELS = (1e-6, 0.1, 0.3, 0.5, 0.7, 0.9, 1 - 1e-6)
 
-KEPT = "`{}` is kept over `reset` (ignore it if it changes nothing)"
-
 
 class Outcome(NamedTuple):
     """What a run came to; ``state`` is the number of the next state, -1 where the episode ended."""
@@ -40,15 +39,15 @@ class Outcome(NamedTuple):
 
 Chances = dict[Any, float]  # of outcomes
 Spans = list[tuple[int, Chances]]  # what an action does from a time on, until the next entry
-Run = Callable[[list[int], int, dict[Any, bool]], Outcome]
 
 
+@dataclass
 class Tree:
     """The tree of draws below one action in one state."""
 
-    def __init__(self, run: Run, script: Script) -> None:
-        self.run, self.script = run, script
-        self.loops: dict[Any, bool] = {}
+    run: Callable[[list[int], int, dict[Any, bool]], Outcome]
+    script: Script
+    loops: dict[Any, bool] = field(default_factory=dict)
 
     def outcomes(self) -> Chances:
         """The probability of each outcome."""
@@ -66,9 +65,15 @@ class Tree:
     ) -> tuple[Chances, Chances]:
         """The chances of the outcomes below these choices, and of coming back to each node above.
 
-        ``back`` collects the runs that came back; ``leaf`` is a run that began with the choices.
+        ``back`` collects the runs that came back; ``leaf`` is a run that began with the choices:
+        its outcome, or the node that it came back to, and its trace.
         """
-        outcome, node, trace = leaf = leaf or self._leaf(choices, root)
+        if leaf is None:
+            try:
+                leaf = self.run(choices, root, self.loops), -1, self.script.trace
+            except Again as again:
+                leaf = None, again.args[0], self.script.trace
+        outcome, node, trace = leaf
         depth = len(choices)
         if len(trace) == depth:
             if outcome is not None:
@@ -92,30 +97,22 @@ class Tree:
             total, returned = ({k: p / (1 - mine) for k, p in x.items()} for x in (total, returned))
         return total, returned
 
-    def _leaf(self, choices: list[int], root: int) -> Any:
-        """One run: its outcome, or the node that it came back to, and its trace."""
-        try:
-            return self.run(choices, root, self.loops), -1, self.script.trace
-        except Again as again:
-            return None, again.args[0], self.script.trace
-
     def _judge(self, place: Any, first: int, choices: list[int]) -> None:
         """Whether a second visit starts again from the first: then the same must follow both."""
         self.loops[place] = True
         back: list[list[int]] = []
         try:
             one, _ = self._below(choices[:first], first, back)
-            for path in back[:3]:
-                other, _ = self._below(path, len(path), [])
-                close = one.keys() == other.keys()
-                if not close or any(abs(one[key] - other[key]) > 1e-9 for key in one):
-                    self.loops[place] = False
-            self.loops[place] &= bool(one)
+            others = [self._below(path, len(path), [])[0] for path in back[:3]]
         except Stop:
             self.loops[place] = False
         except Suspect as inner:  # is judged first
             del self.loops[place]
             self._judge(*inner.args)
+        else:
+            same = all(one.keys() == other.keys() for other in others)
+            same = same and all(abs(p - x[key]) < 1e-9 for x in others for key, p in one.items())
+            self.loops[place] = same and bool(one)
 
 
 @dataclass
@@ -127,6 +124,8 @@ class Search:
     seconds: float
     max_states: int
     progress: Callable[[int, int], None] | None = None
+    seeds: Sequence[int] = ()  # of the resets to start from; none for all resets
+    put: Callable[[bool], Any] = bool  # lets draws follow the script, or not
     started: float = field(default_factory=perf_counter)
 
     def run(self) -> tuple[TransitionModel, Bools]:
@@ -135,8 +134,6 @@ class Search:
             self.state.guess()
             try:
                 self._search()
-                self.state.check_constants()
-                self._check_reset()
                 return self._model()
             except Refuted as refuted:
                 self.state.used.add(refuted.args[0])
@@ -147,55 +144,73 @@ class Search:
         self.observations: list[Any] = []
         self.rows: list[list[Spans]] = []
         self.illegal: dict[str, int] = {}
-        self.end = NEVER  # the time of the last step of the longest episode
-        self.runs, self.check_every = 0, 256
-        start = self.state.save(self.state.variables())
-        self.state.script.time = 0
-        self.initial = self._outcomes(start, None)
+        self.end = NEVER - 1  # the time of the last step of the longest episode
+        self.runs = 0
+        self.initial: Chances = {}
+        self.initial = self._starts(self.state.save(self.state.variables()))
         while len(self.rows) < len(self.saved):
-            state = len(self.rows)
-            self.rows.append([self._spans(state, action) for action in self.actions])
-            if not any(self.rows[-1]):
+            if not any(row := [self._spans(len(self.rows), action) for action in self.actions]):
                 raise Stop(f"every action fails in a state: {next(iter(self.illegal))}")
-            lengths = [len(spans) > 3 for row in self.rows for spans in row] if state == 20 else []
-            if sum(lengths) > len(lengths) / 2:  # time matters all along
+            self.rows.append(row)
+            often = len(self.rows) == 20 and [len(spans) > 3 for row in self.rows for spans in row]
+            if often and np.mean(often) > 0.5:  # time matters all along
                 raise Refuted(next(iter(self.state.clocks)))
-
-    def _check_reset(self) -> None:
-        """A reset must lead to the same states from everywhere."""
-        for outcome in self._outcomes(self.saved[-1], None):
+        self.state.check_constants()
+        for outcome in self._starts(self.saved[-1]):  # a reset forgets all
             if outcome not in self.initial:
-                self._refuse_start(self.state.saved(self.saved[outcome.state]))
+                self.refuse_start(self.state.saved(self.saved[outcome.state]))
 
-    def _refuse_start(self, variables: Saved) -> None:
+    def _starts(self, saved: bytes) -> Chances:
+        """The chances of what a reset leads to; with seeds, each is as likely."""
+        self.state.script.time = 0
+        if not self.seeds:
+            return self._outcomes(saved, None)
+        chances: Chances = defaultdict(float)
+        for seed in self.seeds:
+            self.state.restore(saved)
+            self.put(False)
+            observation, _ = self.state.layers[0].reset(seed=seed)
+            self.put(True)
+            chances[Outcome(self._number(observation, is_reset=True), 0.0)] += 1 / len(self.seeds)
+        return dict(chances)
+
+    def refuse_start(self, variables: Saved) -> None:
         """Name the attribute that no start of an episode has."""
-        starts = [self.state.saved(self.saved[outcome.state]) for outcome in self.initial]
-        for place, value in variables.items():
-            known = {self.state.by_value(start.get(place)) for start in starts}
-            if self.state.by_value(value) not in known:
-                raise Stop(KEPT.format(place[1]))
+        starts = self._values([self.saved[outcome.state] for outcome in self.initial])
+        for name, value in (pair for own in variables for pair in own.items()):
+            if self.state.by_value(value) not in starts[name]:
+                raise Stop(f"`{name}` is kept over `reset` (ignore it if it changes nothing)")
+
+    def _values(self, sample: list[bytes]) -> dict[str, set[Hashable]]:
+        """The values that each attribute has in these states."""
+        values: dict[str, set[Hashable]] = defaultdict(set)
+        for own in (own for saved in sample for own in self.state.saved(saved)):
+            for name, value in own.items():
+                values[name].add(self.state.by_value(value))
+        return values
 
     def _spans(self, state: int, action: Any) -> Spans:
         """What the action does at each time; empty where it is not allowed."""
         spans: Spans = []
-        self.state.script.time = 0
-        while self.state.script.time <= self.end and self.state.script.time < NEVER:
-            time, self.state.script.until = self.state.script.time, NEVER
+        script = self.state.script
+        script.time = 0
+        while script.time <= self.end:
+            time, script.until = script.time, NEVER
             try:
                 chances = self._outcomes(self.saved[state], action)
             except Exception as error:
                 message = f"{type(error).__name__}: {error}"
-                if self.state.script.visits:  # no rule of the game: those come before the draws
+                if script.visits:  # no rule of the game: those come before the draws
                     raise Stop(f"{message}, after a random draw") from error
                 self.illegal[message] = self.illegal.get(message, 0) + 1
                 return []
             spans.append((time, chances))
-            if all(outcome.state < 0 for outcome in chances):
-                if time and any(outcome.truncated for outcome in chances):
+            if time and all(outcome.state < 0 for outcome in chances):
+                if any(outcome.truncated for outcome in chances):
                     self.end = min(self.end, time)
-            elif time == self.end or (len(spans) > MOST_SPANS and self.end == NEVER):
+            elif time and (time == self.end or (len(spans) > MOST_SPANS and self.end > NEVER - 2)):
                 raise Refuted(next(iter(self.state.clocks)))
-            self.state.script.time = self.state.script.until + 1
+            script.time = script.until + 1
         return spans
 
     def _outcomes(self, saved: bytes, action: Any) -> Chances:
@@ -209,126 +224,131 @@ class Search:
     def _step(self, saved: bytes, action: Any) -> Outcome:
         """The outcome of one run under the script; a new state gets the next number."""
         self._tick()
-        self.state.restore(saved)
-        result = take_step(self.state.layers[0], action)
-        observation, reward, *ends = result[:4] if action is not None else (result[0], 0.0, 0, 0)
-        reward = reward.item() if isinstance(reward, np.ndarray) else reward
+        state = self.state
+        state.restore(saved)
+        observation, reward, terminated, truncated = take_step(state.layers[0], action)
+        if isinstance(reward, np.ndarray):
+            reward = reward.item()
         moments = reward.moments() if isinstance(reward, Drawn) else (float(reward), 0.0)
-        if any(ends):
-            self.state.variables()
-            return Outcome(-1, *moments, *map(bool, ends))
-        self.state.check_clocks(is_reset=action is None)
+        if terminated or truncated:
+            state.variables()
+            return Outcome(-1, *moments, bool(terminated), bool(truncated))
+        return Outcome(self._number(observation, is_reset=action is None), *moments)
+
+    def _number(self, observation: Any, is_reset: bool) -> int:
+        """The number of the state that the environment is in; a new one gets the next."""
+        self.state.check_clocks(is_reset)
         variables = self.state.variables()
         key = self.state.key(variables), self.state.by_value(observation)
-        if key not in self.index:
-            if len(self.saved) >= self.max_states:
-                raise Limit(f"more than {self.max_states:,} states{self._growing()}")
+        number = self.index.setdefault(key, len(self.index))
+        if number == len(self.saved):
+            if number >= self.max_states:
+                raise Limit(f"more than {self.max_states:,} states; {self._growing()}")
             self.saved.append(self.state.save(variables))
             self.observations.append(copy.deepcopy(observation))
-        return Outcome(self.index.setdefault(key, len(self.index)), *moments)
+        return number
 
     def _linear(self, outcome: Outcome, saved: bytes, action: Any) -> Outcome:
         """The outcome of a run that made a float of a continuous number.
 
         Only the reward may depend on it, and linearly: then its mean and variance are known.
         """
-        number = self.state.script.floats[0]
-        plain = Drawn(self.state.script, list(number.known))
-        choices, points = [choice for choice, _ in self.state.script.trace], []
-        for level in LEVELS:
-            self.state.script.begin(choices, len(choices), {})
-            self.state.script.level = level
+        script, number = self.state.script, self.state.script.floats[0]
+        plain, choices = Drawn(script, list(number.known)), [choice for choice, _ in script.trace]
+        x, y = np.array([plain.at(level) for level in LEVELS]), []
+        for script.level in LEVELS:
+            script.begin(choices, len(choices), {})
             other = self._step(saved, action)
-            points.append((plain.at(level), other.reward))
-            (x0, y0), (x, y) = points[0], points[-1]
-            if len(points) == 2:
-                slope = (y - y0) / (x - x0)
-            far = level > LEVELS[1] and abs(y0 + slope * (x - x0) - y) > 1e-9 * max(1.0, abs(y))
-            same = other._replace(reward=outcome.reward) == outcome
-            if far or not same or len(self.state.script.floats) > 1:
+            y.append(other.reward)
+            if other._replace(reward=outcome.reward) != outcome or len(script.floats) > 1:
                 number.now()
-        mean, variance = plain.linear(slope, y0 - slope * x0).moments()
+        script.level = 0.5
+        slope = (y[-1] - y[0]) / (x[-1] - x[0])
+        if not np.allclose(y, y[0] + slope * (x - x[0]), rtol=1e-9, atol=1e-9):
+            number.now()
+        mean, variance = plain.linear(slope, y[0] - slope * x[0]).moments()
         return outcome._replace(reward=mean, variance=variance)
 
     def _tick(self) -> None:
         """Watch the time, and now and then the constants."""
         self.runs += 1
-        spent = perf_counter() - self.started
-        if spent > self.seconds:
-            done = f"{len(self.saved):,} states found, {len(self.rows):,} of them done"
-            if not self.rows:
-                done = f"`reset` has more than {len(self.saved):,} outcomes"
-            raise Limit(f"no end after {spent:.0f} seconds: {done}{self._growing()}")
-        if self.runs % self.check_every == 0:
+        if perf_counter() - self.started > self.seconds:
+            done = f"{len(self.saved):,} states found, {len(self.rows):,} of them done; "
+            done = done * bool(self.rows) + self._growing()
+            raise Limit(f"no end after {self.seconds:g} seconds: {done}")
+        if self.runs & (self.runs - 1) == 0:
             self.state.check_constants()
-            if perf_counter() - self.started - spent > 0.05 * spent * self.check_every / self.runs:
-                self.check_every *= 2
-            if self.progress is not None:
-                self.progress(len(self.saved), len(self.rows))
+        if self.progress is not None and self.runs % 256 == 0:
+            self.progress(len(self.saved), len(self.rows))
 
     def _growing(self) -> str:
-        """The attribute that takes most values, as a hint."""
-        values: dict[str, set[Hashable]] = {}
-        sample = self.saved[:: max(1, len(self.saved) // 500)]
-        for saved in sample:
-            for (_, name), value in self.state.saved(saved).items():
-                values.setdefault(name, set()).add(self.state.by_value(value))
-        name = max(values, key=lambda name: len(values[name]), default="")
-        return f"; `{name}` has {len(values[name])} values in {len(sample)} of them" if name else ""
+        """What there is most of: outcomes, or values of an attribute."""
+        if not self.rows:
+            what = "a step" if self.initial else "`reset`"
+            hint = "" if self.initial else " (--starts 0 1 2 takes three)"
+            return f"{what} has more than {self.runs:,} outcomes{hint}"
+        values = self._values(sample := self.saved[:: max(1, len(self.saved) // 500)])
+        name = max(values, key=lambda name: len(values[name]), default="state")
+        return f"`{name}` has {len(values[name])} values in {len(sample)} of them"
 
     def state_now(self, observation: Any, time: int) -> int | None:
         """The number in the model of the state that the environment is in; None if unknown."""
         try:
             variables = self.state.variables()
         except Refuted as refuted:
-            raise Stop(KEPT.format(refuted.args[0][1])) from None
-        key = self.state.key(variables), self.state.by_value(observation)
-        if time == 0 and key not in self.index:
-            self._refuse_start(variables)
-        state = self.index.get(key)
-        return None if state is None else min(time, self.times - 1) * len(self.rows) + state
+            raise Stop(f"`{refuted.args[0][1]}` is changed outside `step`") from None
+        number = self.index.get((self.state.key(variables), self.state.by_value(observation)))
+        if time == 0 and number is None:
+            self.refuse_start(variables)
+        return None if number is None else min(time, self.times - 1) * len(self.rows) + number
 
     @property
     def horizon(self) -> int | None:
         """The steps of the longest episode, where the environment itself counts them."""
-        return self.end + 1 if self.state.clocks and self.end < NEVER else None
+        return self.end + 1 if self.state.clocks and self.end < NEVER - 1 else None
 
     def _count_times(self) -> int:
         """At how many times the states of the model are told apart; 1 if time changes nothing."""
         for (_, usual), *later in (spans for row in self.rows for spans in row if spans):
             if any(first < self.end or not _alike(usual, chances) for first, chances in later):
-                if self.end == NEVER:
+                if self.horizon is None:
                     raise Refuted(next(iter(self.state.clocks)))
                 return self.end + 1
         return 1
 
     def _model(self) -> tuple[TransitionModel, Bools]:
         """The model, whose state at time t has the number t * states + state, and its mask."""
-        n, times = len(self.rows), self._count_times()
-        self.times = times
-        most = max(len(chances) for row in self.rows for spans in row for _, chances in spans)
-        shape = times, n, len(self.actions), most
+        entries = [
+            (first, s, a, k, p, o.reward, o.variance, o.state < 0, max(o.state, 0))
+            for s, row in enumerate(self.rows)
+            for a, spans in enumerate(row)
+            for first, chances in spans
+            for k, (o, p) in enumerate(chances.items())
+        ]
+        columns = np.array(entries, float).T
+        first, s, a, k = columns[:4].astype(np.int64)
+        n, self.times = len(self.rows), self._count_times()
+        shape = self.times, n, len(self.actions), int(k.max()) + 1
         if 5 * np.prod(shape, dtype=float) > MOST_ENTRIES:
-            raise Stop(f"a model of {n:,} states at {times:,} times, {most} outcomes is too large")
+            raise Limit(f"a model of {n:,} states at {self.times:,} times is too large")
         table = np.zeros((5, *shape))  # probability, reward, variance, end, next state
         table[0, ..., 0] = table[3] = 1.0  # of actions that are not allowed
-        for s, actions in enumerate(self.rows):
-            for a, spans in enumerate(actions):
-                for first, chances in spans:
-                    row = [(p, *o[1:3], o.state < 0, max(o.state, 0)) for o, p in chances.items()]
-                    table[:, first:, s, a] = 0.0
-                    table[:, first:, s, a, : len(row)] = np.transpose(row)[:, None]
+        for time in range(self.times):
+            at = first == time
+            table[:, time:, s[at], a[at]] = 0.0
+            table[:, time:, s[at], a[at], k[at]] = columns[4:, None, at]
         table[0] /= table[0].sum(axis=3, keepdims=True)
-        table[4] += n * np.minimum(np.arange(times) + 1, times - 1)[:, None, None, None]
-        prob, reward, variance, ends, following = table.reshape(5, times * n, *shape[2:])
-        initial = np.zeros(times * n)
+        table[4] += n * np.minimum(np.arange(self.times) + 1, self.times - 1)[:, None, None, None]
+        prob, reward, variance, ends, following = table.reshape(5, self.times * n, *shape[2:])
+        initial = np.zeros(self.times * n)
         for outcome, p in self.initial.items():
             initial[outcome.state] = p / sum(self.initial.values())
         noise = variance if variance.any() else None
         model = TransitionModel(
             prob, following.astype(np.int64), reward, ends.astype(np.bool_), initial, noise
         )
-        return model, np.tile([[bool(spans) for spans in row] for row in self.rows], (times, 1))
+        mask = [[bool(spans) for spans in row] for row in self.rows]
+        return model, np.tile(mask, (self.times, 1))
 
 
 def _alike(one: Chances, other: Chances) -> bool:

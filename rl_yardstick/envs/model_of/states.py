@@ -16,7 +16,6 @@ import enum
 import io
 import pickle
 import types
-from collections import deque
 from collections.abc import Hashable, Iterable
 from typing import Any
 
@@ -28,16 +27,18 @@ from rl_yardstick.envs.model_of.symbols import Stop, Symbol
 
 Env = gym.Env[Any, Any]
 Place = tuple[int, str]  # of an attribute: the number of the layer, the outermost first; the name
-Saved = dict[Place, Any]
+Saved = list[dict[str, Any]]  # attributes of each layer
 
 TRANSPARENT = {"HumanRendering", "Monitor", "OrderEnforcing", "PassiveEnvChecker", "TimeLimit"}
 TRANSPARENT |= {"RecordEpisodeStatistics", "RecordVideo", "RenderCollection"}
 NO_STATE = {"_cached_spec", "_np_random_seed", "action_space", "env", "metadata"}
 NO_STATE |= {"observation_space", "render_mode", "spec"}
-ATOMS = frozenset({int, float, str, bool, bytes, complex, type(None)})
-BY_IDENTITY: tuple[type, ...] = (types.FunctionType, types.BuiltinFunctionType, types.ModuleType)
-BY_IDENTITY += (type, np.dtype, np.ufunc, gym.Space, enum.Enum, gym.Env)
-LEAVES: tuple[Any, ...] = (*BY_IDENTITY, *GENERATORS, *ATOMS)
+PLAYED = 50  # steps of each of the two episodes that are played first
+SIMPLE = (int, float, str, bytes, complex, types.NoneType, np.generic)
+ATOMS = frozenset({*SIMPLE, bool})
+NUMBERS = (np.generic, Symbol)
+BY_IDENTITY: tuple[Any, ...] = (types.FunctionType, types.BuiltinFunctionType, types.ModuleType)
+BY_IDENTITY += (type, np.dtype, np.ufunc, gym.Space, enum.Enum, gym.Env, *GENERATORS)
 
 
 class Refuted(BaseException):
@@ -45,21 +46,18 @@ class Refuted(BaseException):
 
 
 class Ghost(Symbol):
-    """An attribute that is written and never read; numbers and items may be added to it."""
+    """Something that nobody reads: numbers and items may be added to it, the rest raises."""
 
-    def now(self) -> Any:
-        raise Refuted(self.known)
+    def now(self, *given: Any) -> Any:
+        raise self.known
+
+    __getattr__ = __len__ = __getitem__ = __setitem__ = __iter__ = __contains__ = now
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **keywords: Any) -> Any:
         return self if ufunc in (np.add, np.subtract, np.multiply) else self.now()
 
     def append(self, item: Any) -> None:
         """Nobody reads what is appended."""
-
-    def _used(self, *given: Any) -> Any:
-        raise Refuted(self.known)
-
-    __getattr__ = __len__ = __getitem__ = __setitem__ = __iter__ = __contains__ = _used
 
 
 class Clock(Symbol):
@@ -74,6 +72,40 @@ class Clock(Symbol):
         if is_below := bool(self.script.time <= last):
             self.script.until = int(min(last, self.script.until))
         return is_below
+
+
+class ByValue(pickle.Pickler):
+    """Equal values become equal bytes; which parts are shared counts."""
+
+    def __init__(self, file: io.BytesIO, state: State) -> None:
+        super().__init__(file)
+        self.fast = True  # writes strings where they are, and not where they were first
+        self.reference = state.reference
+        self.seen: dict[int, Any] = {}  # kept alive, so that no other object gets the same id
+
+    def persistent_id(self, value: Any) -> Any:
+        kind, i = type(value), id(value)
+        if kind in ATOMS:
+            return value
+        if kind is tuple:
+            return None
+        if i in self.seen:
+            return "again", self.seen[i][0]
+        if isinstance(value, NUMBERS):
+            return value.now() if isinstance(value, Symbol) else value.item()
+        self.seen[i] = len(self.seen), value
+        if kind is np.ndarray and value.dtype != object:
+            return value.dtype.char, value.shape, value.tobytes()
+        if self.reference(value) is not None:
+            return "generator" if isinstance(value, GENERATORS) else ("object", i)
+        return ("set", *sorted(value, key=hash)) if kind in (set, frozenset) else None
+
+    def reducer_override(self, value: Any) -> Any:
+        try:
+            parts = value.__reduce_ex__(4)
+        except Exception:  # noqa: BLE001 (classes decide what they raise)
+            parts = ""
+        return (int, (id(value),)) if isinstance(parts, str) else parts  # as an object, by identity
 
 
 class State:
@@ -92,10 +124,10 @@ class State:
         self.script, self.no_state = script, NO_STATE | set(ignored)
         self.used: set[Place] = set()  # guesses that were wrong
         self.clocks: dict[Place, int] = {}  # with their values at the start of an episode
-        self.hidden: set[Place] = set()  # ghosts and clocks
-        self.watched: dict[Place, Any] = {}  # and what was written to them last
-        self.constants: dict[Place, tuple[Any, Hashable]] = {}
-        self.kept: dict[int, Any] = {}  # the layers, and what constants are made of, by id
+        self.watched: dict[Place, Any] = {}  # what was last written to ghosts and clocks
+        self.constants: dict[Place, Hashable] = {}  # by value
+        self.fixed: Saved = []  # the constants of each layer, and what is no state
+        self.kept: dict[int, Any] = {}  # objects that are saved by reference, by id
 
     def restore_original(self, without_transparent: bool) -> None:
         """Give the layers the classes and attributes that they had."""
@@ -107,43 +139,40 @@ class State:
             if without_transparent:
                 vars(outer)["env"] = inner
 
-    def attributes(self) -> list[tuple[Place, Any]]:
-        """All attributes that can be a part of the state, and their values."""
-        return [
-            ((i, name), value)
+    def attributes(self) -> dict[Place, Any]:
+        """All attributes that can be a part of the state."""
+        return {
+            (i, name): value
             for i, layer in enumerate(self.layers)
             for name, value in vars(layer).items()
-            if name not in self.no_state
-            and (i, name) not in self.hidden
-            and (type(value) in ATOMS or not isinstance(value, GENERATORS))
-        ]
+            if name not in self.no_state and not isinstance(value, GENERATORS)
+        }
 
-    def play(self, actions: list[Any], episodes: int = 2, steps: int = 50) -> None:
+    def play(self, actions: list[Any]) -> None:
         """See in a short play which attributes nothing changes, and which count the steps."""
         env, rng = self.layers[0], np.random.default_rng(0)
-        same: dict[Place, Hashable] = {}
-        counting: dict[Place, int] = {}
-        for episode in range(episodes):
-            env.reset(seed=episode)
-            ended = False
-            for step in range(steps + 1):
-                now = {p: v - step for p, v in self.attributes() if type(v) is int}
-                counting = now if episode == step == 0 else dict(counting.items() & now.items())
-                if step in (0, steps) or ended:
-                    values = {place: self.by_value(value) for place, value in self.attributes()}
-                    same = values if episode == step == 0 else dict(same.items() & values.items())
-                if step == steps or ended:
-                    break
+        counts, values = [], []
+
+        def note() -> None:
+            now = self.attributes().items()
+            values.append({(place, self.by_value(value)) for place, value in now})
+
+        for seed in (0, 1, 0):
+            env.reset(seed=seed)
+            note()
+            for step in range(PLAYED):
+                now = self.attributes().items()
+                counts.append({(p, value - step) for p, value in now if type(value) is int})
                 try:
-                    ended = any(env.step(actions[rng.integers(len(actions))])[2:4])
+                    if any(env.step(actions[rng.integers(len(actions))])[2:4]):
+                        break
                 except Exception:  # noqa: BLE001 (a step that is not allowed ends the episode)
                     break
+            note()
         env.reset(seed=0)
         self.layers[-1].np_random  # noqa: B018 (makes it)
-        self.counting, self.left_alone = counting, {}
-        for place, value in self.attributes():
-            if place in same and self.by_value(value) == same[place]:
-                self.left_alone[place] = value, same[place]
+        self.counting = dict(set.intersection(*counts))
+        self.left_alone = dict(set.intersection(*values))
         self.start = [dict(vars(layer)) for layer in self.layers]
 
     def guess(self) -> None:
@@ -151,16 +180,19 @@ class State:
         for (layer, kind, _), held in zip(self.original, self.start, strict=True):
             layer.__class__ = kind
             vars(layer).update((k, v) for k, v in held.items() if not isinstance(v, GENERATORS))
-        self.hidden = set()
-        places = [place for place, _ in self.attributes() if place not in self.used]
-        self.constants = {p: self.left_alone[p] for p in places if p in self.left_alone}
-        self.kept = parts_of([value for value, _ in self.constants.values()])
+        guessed = {p: value for p, value in self.attributes().items() if p not in self.used}
+        self.constants = {p: self.left_alone[p] for p in guessed if p in self.left_alone}
+        self.kept = self.parts([guessed[place] for place in self.constants])
         self.kept |= {id(layer): layer for layer in self.layers}
-        rest = [place for place in places if place not in self.constants]
-        self.clocks = {p: self.counting[p] for p in rest if p in self.counting}
-        self.hidden = set(rest)
+        self.watched = {p: value for p, value in guessed.items() if p not in self.constants}
+        self.clocks = {p: self.counting[p] for p in self.watched if p in self.counting}
+        self.fixed = []
         for i, layer in enumerate(self.layers):
-            names = {place[1]: self._property(place) for place in rest if place[0] == i}
+            fixed = {k: v for k, v in vars(layer).items() if (i, k) not in self.used}
+            self.fixed.append(dict.fromkeys(self.no_state) | fixed)
+            names = {name: self._property((j, name)) for j, name in self.watched if i == j}
+            for name in names:
+                del vars(layer)[name]
             kind = type(layer)
             layer.__class__ = type(kind.__name__, (kind,), {"__module__": kind.__module__} | names)
 
@@ -172,71 +204,76 @@ class State:
             if place in self.clocks:
                 return value
             if isinstance(value, Ghost | int | float | list | np.number):
-                return Ghost(self.script, place)
+                return Ghost(self.script, Refuted(place))
             raise Refuted(place)
 
-        def write(_: Env, value: Any) -> None:
-            self.watched[place] = value
-
-        self.watched[place] = vars(self.layers[place[0]]).pop(place[1])
-        return property(read, write)
+        return property(read, lambda _, value: self.watched.update({place: value}))
 
     def check_clocks(self, is_reset: bool) -> None:
         """Every clock must have counted the step, or start anew."""
         for place, start in self.clocks.items():
             value = self.watched[place]
-            if is_reset or not isinstance(value, Clock):
-                right = is_reset and type(value) is int and value == start
-            else:
-                right = (value.scale, value.shift) == (1, start + 1)
+            right = type(value) is int and value == start
+            if not is_reset:
+                right = isinstance(value, Clock) and (value.scale, value.shift) == (1, start + 1)
             if not right:
                 raise Refuted(place)
 
     def check_constants(self) -> None:
         """Constants must not have changed in place."""
         kept, self.kept = self.kept, {}
-        wrong = [p for p, (value, held) in self.constants.items() if self.by_value(value) != held]
+        now = {(i, name): self.by_value(self.fixed[i][name]) for i, name in self.constants}
         self.kept = kept
-        if wrong:
-            raise Refuted(wrong[0])
+        for place, value in self.constants.items():
+            if now[place] != value:
+                raise Refuted(place)
 
     def variables(self) -> Saved:
         """The attributes that are the state now."""
-        found = {}
-        for place, value in self.attributes():
-            constant = self.constants.get(place)
-            if constant is None:
-                found[place] = value
-            elif value is not constant[0]:
-                if self.by_value(value) != constant[1]:
-                    raise Refuted(place)
-                vars(self.layers[place[0]])[place[1]] = constant[0]
+        found = []
+        for i, layer in enumerate(self.layers):
+            held, fixed, own = vars(layer), self.fixed[i], {}
+            for name in sorted(held):
+                value = held[name]
+                if name not in fixed:
+                    own[name] = value
+                elif value is not fixed[name] and (i, name) in self.constants:
+                    if self.by_value(value) != self.constants[i, name]:
+                        raise Refuted((i, name))
+                    held[name] = fixed[name]
+            found.append(own)
         return found
 
     def key(self, variables: Saved) -> Hashable:
         """The state by value."""
-        seen: dict[int, Any] = {}
-        return tuple(
-            [(place, self.by_value(variables[place], seen)) for place in sorted(variables)]
-        )
+        flat = [pair for own in variables for pair in own.items()]
+        rest = [value for _, value in flat if not isinstance(value, SIMPLE)]
+        if not rest:
+            return tuple(flat)
+        simple = [pair if isinstance(pair[1], SIMPLE) else pair[0] for pair in flat]
+        return tuple(simple), self.by_value(rest if len(rest) > 1 else rest[0])
 
     def save(self, variables: Saved) -> bytes:
         """A state to restore, in which constants are the objects that they were."""
         file = io.BytesIO()
         pickler: Any = pickle.Pickler(file)
-        pickler.persistent_id = self._reference
+        pickler.persistent_id = self.reference
         try:
             pickler.dump(variables)
         except (TypeError, AttributeError, pickle.PicklingError) as error:
-            for place, value in variables.items() if len(variables) > 1 else ():
-                self.save({place: value})
-            raise Stop(f"`{next(iter(variables))[1]}` cannot be saved: {error}") from None
+            single = [(name, value) for layer in variables for name, value in layer.items()]
+            for name, value in single if len(single) > 1 else ():
+                self.save([{name: value}])
+            raise Stop(f"`{single[0][0]}` cannot be saved: {error}") from None
         return file.getvalue()
 
-    def _reference(self, value: Any) -> int | None:
-        if isinstance(value, (*BY_IDENTITY, *GENERATORS)):
+    def reference(self, value: Any) -> int | None:
+        """The number of an object that is not saved, as it stays the same."""
+        if id(value) not in self.kept:
+            if type(value) in ATOMS or not isinstance(value, BY_IDENTITY):
+                return None
             self.kept[id(value)] = value
-        return id(value) if id(value) in self.kept else None
+        return id(value)
 
     def saved(self, saved: bytes) -> Saved:
         """The attributes of a saved state."""
@@ -247,61 +284,27 @@ class State:
 
     def restore(self, saved: bytes) -> None:
         """Put a saved state into the environment, whose clocks show the script's time."""
-        values = self.saved(saved)
-        for (i, name), _ in self.attributes():
-            if (i, name) not in values and (i, name) not in self.constants:
-                del vars(self.layers[i])[name]
-        for (i, name), value in values.items():
-            vars(self.layers[i])[name] = value
+        for layer, fixed, values in zip(self.layers, self.fixed, self.saved(saved), strict=True):
+            held = vars(layer)
+            for name in held.keys() - values.keys() - fixed.keys():
+                del held[name]
+            held.update(values)
         for place, start in self.clocks.items():
             self.watched[place] = Clock(self.script, None, 1, start)
 
-    def by_value(self, value: Any, seen: dict[int, Any] | None = None) -> Hashable:
-        """Something hashable that is equal for equal values; which parts are shared counts."""
-        kind, i = type(value), id(value)
-        seen = {} if seen is None else seen
-        if kind in ATOMS or isinstance(value, np.generic):
-            return value  # type: ignore[no-any-return]
-        if kind is tuple:
-            return tuple([self.by_value(part, seen) for part in value])
-        if isinstance(value, GENERATORS):
-            return "generator"
-        if isinstance(value, Symbol):
-            return value.now()  # type: ignore[no-any-return]
-        if i in seen:
-            return "again", seen[i][0]
-        if i in self.kept or isinstance(value, BY_IDENTITY):
-            return "object", i
-        seen[i] = len(seen), value
-        if kind is np.ndarray and value.dtype != object:
+    def by_value(self, value: Any) -> Hashable:
+        """Something hashable that is equal for equal values."""
+        if isinstance(value, SIMPLE):
+            return value
+        if type(value) is np.ndarray and value.dtype != object:
             return value.dtype.char, value.shape, value.tobytes()
-        if kind in (set, frozenset):
-            return kind, frozenset([self.by_value(part) for part in value])
-        parts: Any = value
-        if kind is dict:
-            parts = value.items()
-        elif kind is not list:
-            try:
-                parts = [list(x) if hasattr(x, "__next__") else x for x in value.__reduce_ex__(4)]
-            except Exception:  # noqa: BLE001 (classes decide what they raise)
-                return "object", i
-            seen[-len(seen)] = 0, parts  # their ids are not used again while these live
-        return kind, *[self.by_value(part, seen) for part in parts]
+        file = io.BytesIO()
+        ByValue(file, self).dump(value)
+        return file.getvalue()
 
-
-def parts_of(values: list[Any]) -> dict[int, Any]:
-    """The values and all objects that they hold, by id."""
-    found: dict[int, Any] = {}
-    todo = list(values)
-    while todo:
-        value = todo.pop()
-        if id(value) in found or isinstance(value, LEAVES):
-            continue
-        found[id(value)] = value
-        parts: Iterable[Any] = getattr(value, "__dict__", {}).values()
-        if isinstance(value, dict | list | tuple | set | deque):
-            parts = value.values() if isinstance(value, dict) else value
-        elif isinstance(value, np.ndarray) and value.dtype == object:
-            parts = value.ravel().tolist()
-        todo.extend([part for part in parts if type(part) not in ATOMS])
-    return found
+    def parts(self, value: Any) -> dict[int, Any]:
+        """The objects that a value is made of, by id."""
+        self.kept = {}
+        pickler = ByValue(io.BytesIO(), self)
+        pickler.dump(value)
+        return {i: part for i, (_, part) in pickler.seen.items()}

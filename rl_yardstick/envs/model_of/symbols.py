@@ -13,13 +13,18 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, NamedTuple, Self
+from types import SimpleNamespace
+from typing import Any, Self
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 TAIL = 1e-15  # of a distribution, left out
 NOT_OF_AN_ENVIRONMENT = (str(Path(__file__).parent), np.__path__[0])
+NORMAL = NormalDist()
+UNIFORM = SimpleNamespace(
+    cdf=lambda x: min(max(x, 0.0), 1.0), inv_cdf=lambda q: q, mean=0.5, variance=1 / 12
+)
 
 
 class Stop(BaseException):
@@ -55,17 +60,10 @@ class Symbol(NDArrayOperatorsMixin):
         """``scale`` times this number plus ``shift``."""
         return type(self)(self.script, self.known, self.scale * scale, self.shift * scale + shift)
 
-    def is_negative(self, or_zero: bool) -> Any:
-        """Whether it is below zero, or at most zero; an array if the shift is one."""
-        if self.scale == 0:
-            return self.shift <= 0 if or_zero else self.shift < 0
-        is_below = self.below(-self.shift / self.scale, or_zero == (self.scale > 0))
-        return is_below if self.scale > 0 else np.logical_not(is_below)
-
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **keywords: Any) -> Any:
         if isinstance(keywords.get("out", (None,))[0], Symbol):
             del keywords["out"]  # `x += 1` makes a new number
-        rule = (DRAWN_RULES if isinstance(self, Drawn) else RULES).get(ufunc)
+        rule = RULES.get(ufunc)
         if rule is None or method != "__call__" or keywords:
             inputs = tuple(x.now() if isinstance(x, Symbol) else x for x in inputs)
             result = getattr(ufunc, method)(*inputs, **keywords)
@@ -93,9 +91,10 @@ def _add(a: Any, b: Any, sign: int = 1) -> Any:
         return a.linear(1, sign * b)
     if not isinstance(a, Symbol):
         return b.linear(sign, a)
-    if a.known is b.known:
-        return type(a)(a.script, a.known, a.scale + sign * b.scale, a.shift + sign * b.shift)
-    return a + sign * b.now() if isinstance(a, Drawn) else a.now() + sign * b
+    if a.known is not b.known:
+        return a + sign * b.now()
+    scale, shift = a.scale + sign * b.scale, a.shift + sign * b.shift
+    return type(a)(a.script, a.known, scale, shift) if scale else shift
 
 
 def _multiply(a: Any, b: Any) -> Any:
@@ -106,10 +105,11 @@ def _multiply(a: Any, b: Any) -> Any:
 
 
 def _less(a: Any, b: Any, or_equal: bool = False) -> Any:
-    difference = _add(a, b, -1)
-    if isinstance(difference, Symbol):
-        return difference.is_negative(or_equal)
-    return difference <= 0 if or_equal else difference < 0
+    x = _add(a, b, -1)
+    if not isinstance(x, Symbol):
+        return x <= 0 if or_equal else x < 0
+    is_below = x.below(-x.shift / x.scale, or_equal == (x.scale > 0))
+    return is_below if x.scale > 0 else np.logical_not(is_below)
 
 
 def _equal(a: Any, b: Any) -> Any:
@@ -120,6 +120,7 @@ RULES: dict[np.ufunc, Callable[..., Any]] = {
     np.add: _add,
     np.subtract: lambda a, b: _add(a, b, -1),
     np.multiply: _multiply,
+    np.divide: lambda a, b: a / b.now() if isinstance(b, Symbol) else _multiply(a, 1 / b),
     np.negative: lambda a: a.linear(-1, 0),
     np.less: _less,
     np.less_equal: lambda a, b: _less(a, b, or_equal=True),
@@ -127,28 +128,12 @@ RULES: dict[np.ufunc, Callable[..., Any]] = {
     np.greater_equal: lambda a, b: _less(b, a, or_equal=True),
     np.equal: _equal,
     np.not_equal: lambda a, b: np.logical_not(_equal(a, b)),
-}
-DRAWN_RULES: dict[np.ufunc, Callable[..., Any]] = RULES | {
     np.maximum: lambda a, b: b if a < b else a,
     np.minimum: lambda a, b: a if a < b else b,
-    np.divide: lambda a, b: a.linear(1 / b, 0),
     np.floor: lambda a: float(math.floor(a)),
     np.ceil: lambda a: float(math.ceil(a)),
     np.floor_divide: lambda a, b: float(math.floor(a / b)),
 }
-
-
-class Law(NamedTuple):
-    """A continuous distribution."""
-
-    cdf: Callable[[float], float]
-    quantile: Callable[[float], float]
-    mean: float
-    variance: float
-
-
-UNIFORM = Law(lambda x: min(max(x, 0.0), 1.0), lambda q: q, 0.5, 1 / 12)
-NORMAL = Law(NormalDist().cdf, NormalDist().inv_cdf, 0.0, 1.0)
 
 
 class Drawn(Symbol):
@@ -170,7 +155,7 @@ class Drawn(Symbol):
         """Its value at a quantile of what is known."""
         law, low, high, _ = self.known
         q = min(max(low + quantile * (high - low), TAIL), 1 - TAIL)
-        return float(self.scale * law.quantile(q) + self.shift)
+        return float(self.scale * law.inv_cdf(q) + self.shift)
 
     def __floor__(self) -> int:
         first, last = (math.floor(end) for end in sorted((self.at(0.0), self.at(1.0))))
@@ -191,25 +176,19 @@ class Drawn(Symbol):
         whole = math.floor(self * power + 0.5)
         return whole if digits is None else whole / power
 
-    def rint(self) -> float:
-        """To the nearest whole number; `numpy.round` calls it."""
-        return float(round(self))
-
     def now(self) -> Any:
         raise Stop(f"{self.known[3]} draws a continuous number, which reaches the state")
 
     def __float__(self) -> float:
-        # The reward may depend on it linearly: see `search`.
-        self.script.floats.append(self)
+        self.script.floats.append(self)  # the reward may depend on it linearly: see `search`
         return self.at(self.script.level)
 
     def moments(self) -> tuple[float, float]:
         """Its mean and variance."""
         law, low, high, place = self.known
+        mean, variance = law.mean, law.variance
         if law is UNIFORM:
             mean, variance = (low + high) / 2, (high - low) ** 2 / 12
-        elif (low, high) == (0.0, 1.0):
-            mean, variance = law.mean, law.variance
-        else:
+        elif (low, high) != (0.0, 1.0):
             raise Stop(f"{place} draws a continuous reward that is cut off at a bound")
         return self.scale * mean + self.shift, self.scale**2 * variance
