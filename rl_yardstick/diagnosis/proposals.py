@@ -207,7 +207,7 @@ class _Case:
     def _away(self, key: str) -> float:
         """How far a setting lies above (+) or below (-) the shipped one."""
         own, usual = self.own.get(key), self.usual.get(key)
-        if key == "gamma" and all(isinstance(one, int | float) for one in (own, usual)):
+        if key == "gamma" and isinstance(own, int | float) and isinstance(usual, int | float):
             # the inverse of the steps that it looks ahead
             return float(np.clip(_distance(1 - usual, 1 - own), -MOST_OF_GAMMA, MOST_OF_GAMMA))
         return _distance(own, usual)
