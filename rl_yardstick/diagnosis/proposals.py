@@ -3,7 +3,9 @@
 Planning gives the share of the gap that another discount or unchanged rewards close. The rest has
 causes in learning. There, a change has a weight, a rule of thumb from exact quantities: how often
 the actions on the best path were updated, and would be with other exploration; how much their
-initial values still count; and how far a setting is from the shipped one.
+initial values still count; and how far a setting is from the shipped one. Where one setting is far
+off, others have little weight, and a change with little weight is not proposed. Where several
+settings differ from the shipped ones, the second proposal is all of these at once.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from rl_yardstick.mdp import (
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.components import constructor_parameters
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
-from rl_yardstick.pipeline.settings import literal, shipped_hyperparams
+from rl_yardstick.pipeline.settings import entry_names, literal, shipped_hyperparams
 from rl_yardstick.pipeline.spec import TrainSpec
 
 if TYPE_CHECKING:
@@ -47,6 +49,8 @@ _WITH_RULE = {*EXPLORATION, "gamma", "learning_rate", "initial_q", "policy_kwarg
 _NO_CAUSE = {"policy", "engine", "mask_actions", "seed", "device", "verbose"}
 # More of these than shipped does no harm.
 _HARMLESS_ABOVE = {"buffer_size", "batch_size", "n_epochs", "planning_steps"}
+# Settings of the training that are no arguments of the agent.
+_AROUND = {*VARIANT, "normalize", "n_envs"}
 FACTOR = 4  # for more steps, another step size, a larger network
 ENOUGH = 10  # updates of an action
 LEARNING = ("never tried", "not settled", "look-ahead", "learning")  # parts with causes in learning
@@ -55,8 +59,16 @@ MOMENTS = np.array([0.1, 0.3, 0.5, 0.7, 0.9])  # of the training, at which sched
 BLUR, TIE = 0.02, 1e-9
 # The agent's value of the start, as a share of the value of standing still, if it stands still.
 STANDS_STILL = (0.8, 1.2)
+HARDLY_MORE = 0.5  # the best value of the start, relative to the same, if the goal is hidden
 MOST_OTHERS = 3  # settings that are proposed only because the shipped ones differ
 DIFFERENT = 0.4  # the least distance from the shipped value
+# How much less other changes weigh for each unit of distance: from an environment's own entry,
+# and from an agent's default one.
+BLAME, BLAME_OF_DEFAULT = 3.0, 0.5
+SURELY_ODD = 3.0  # about twenty times the shipped value, or a twentieth
+MOST_OF_GAMMA = 2.0  # beyond this distance of a discount, planning tells its effect
+RARELY = 0.01  # a mean epsilon with which hardly anything new is tried
+LEAST_SCORE, LEAST_RELATIVE = 0.05, 0.25  # of a proposal, and relative to the first one's
 MOST_OUTCOMES = 20_000_000  # of all states at all steps, in which to predict updates
 
 # A change, its weight among the causes in learning, and the share of the gap that planning gives.
@@ -68,14 +80,36 @@ def proposals(spec: TrainSpec, found: Found, parts: tuple[Part, ...]) -> tuple[s
     if isinstance(found.agent, PlanningAgent | RandomAgent):
         return ()
     case = _Case(spec, found, parts)
-    scores: dict[str, float] = {}
+    scores: dict[str, tuple[float, float]] = {}
+    worth: dict[str, float] = {}
     for change, weight, share in case.changes():
         kept = {key: value for key, value in change.items() if value != case.own.get(key)}
-        text = " ".join(f"{key}:{_text(value)}" for key, value in kept.items())
-        score = min(max(share, 0.0), 1.0) + case.rest * weight / (1 + weight)
-        if kept:
-            scores[text] = max(score, scores.get(text, 0.0))
-    return tuple(sorted(scores, key=lambda one: -scores[one]))
+        if not kept:
+            continue
+        is_odd = not case.odd.keys().isdisjoint(kept)
+        blamed = weight if is_odd else weight / (1 + case.blame)
+        score, least = (
+            min(max(share, 0.0), 1.0) + case.rest * one / (1 + one) for one in (blamed, weight)
+        )
+        typed = _typed(kept)
+        # about equal scores go by their weights
+        scores[typed] = max((round(score, 1), blamed), scores.get(typed, (0.0, 0.0)))
+        worth[typed] = max(score if case.is_sure else least, worth.get(typed, 0.0))
+    ranked = sorted(scores, key=scores.__getitem__, reverse=True)
+    relative = LEAST_RELATIVE * max(worth.values(), default=0.0) if case.is_sure else 0.0
+    ranked = [one for one in ranked if worth[one] >= max(LEAST_SCORE, relative)]
+    # the second proposal changes other settings than the first
+    ranked[1:] = sorted(ranked[1:], key=lambda one: not _topics(one).isdisjoint(_topics(ranked[0])))
+    at_once = _typed({key: case.usual.get(key) for key in case.odd})
+    if len(_topics(at_once)) > 1:
+        ranked.insert(1, at_once)
+    return tuple(dict.fromkeys(ranked))
+
+
+def _topics(typed: str) -> set[str]:
+    """The settings of a change; those of epsilon count as one."""
+    keys = {one.partition(":")[0] for one in typed.split()}
+    return {FIRST if key in EXPLORATION else key for key in keys}
 
 
 class _Case:
@@ -91,11 +125,20 @@ class _Case:
         self.known = {*known} - _NO_CAUSE
         self.own = {**known, **spec.hyperparams}
         self.usual = {**known, **shipped_hyperparams(spec)}
+        self.odd = self._far_off()
+        oddest = max(map(abs, self.odd.values()), default=0.0)
+        now, usual = self._budgets()
+        self.short = max(float(np.log(max(usual, 1) / now)), 0.0)  # of steps
+        self.is_entry = spec.env_id in entry_names(spec.algo)
+        self.blame = BLAME if self.is_entry else BLAME_OF_DEFAULT
+        self.blame *= max(oddest - self.short, 0.0)
         self.is_network = is_network(found.agent)
         self.model = found.model if found.task is None else found.task.model
         random = (self.model.prob > 0).sum(axis=2)[self.model.reachable].max() > 1
         self.has_errors = self.is_network or bool(random) or self.model.reward_variance is not None
         self.rates, self.epsilons = _course(self.own.get("learning_rate")), self._epsilons({})
+        # a network has no counts of updates: only a setting that is very far off is a sure cause
+        self.is_sure = not self.is_network or oddest > SURELY_ODD
         with closing(make_single_env(spec, training=True)) as env:
             self.limit = time_limit(env) or found.horizon
         # the best actions for the agent's own objective, and the share of each state in their
@@ -105,6 +148,10 @@ class _Case:
         self.best: Ints = values.argmax(axis=1)
         visits = state_visitation(found.model, self.best, found.horizon)
         self.path: Floats = visits / visits.sum() * is_known
+        # whether it learns from what it happens to do first: no exploration, no optimistic values
+        is_greedy = self.epsilons is not None and self.epsilons.mean() < RARELY
+        modest = self.own.get("initial_q", 0.0) < values.max(axis=1)[self.model.reachable].max()
+        self.is_blind = is_greedy and modest and not self.is_network
         is_short = is_known and self.limit < found.horizon
         self.out_of_reach = self._chance_out_of_reach() if is_short else 0.0
         # how often the best action of each state was updated, or may have been
@@ -143,31 +190,55 @@ class _Case:
             wide = wide if lacks > DIFFERENT else [FACTOR * max(one, 16) for one in widths or [16]]
             told = ",".join(f"{k}={_text(v)}" for k, v in {**own, "net_arch": wide}.items())
             yield {"policy_kwargs": f"dict({told})"}, 0.15 + lacks, 0.0
-        others = [(self._away(key), key) for key in (self.known | {*VARIANT}) - _WITH_RULE]
-        others = [one for one in others if abs(one[0]) > DIFFERENT and self.usual.get(one[1])]
-        others = [one for one in others if one[0] < 0 or one[1] not in _HARMLESS_ABOVE]
-        for away, key in sorted(others, key=lambda one: (-abs(one[0]), one[1]))[:MOST_OTHERS]:
-            yield {key: self.usual[key]}, 0.5 * abs(away), 0.0
+        for key in [key for key in self.odd if key not in {*_WITH_RULE, *VARIANT}][:MOST_OTHERS]:
+            ties = 2 * self.starved if key == "tie_breaking" else 0.0  # hide untried actions
+            yield {key: self.usual.get(key)}, 0.5 * abs(self.odd[key]) + ties, 0.0
+
+    def _far_off(self) -> dict[str, float]:
+        """The distances of the settings that are far from the shipped ones, the largest first."""
+        found = {key: self._away(key) for key in self.known | _AROUND}
+        far = {
+            key: away
+            for key, away in found.items()
+            if abs(away) > DIFFERENT and (away < 0 or key not in _HARMLESS_ABOVE)
+        }
+        return dict(sorted(far.items(), key=lambda one: (-abs(one[1]), one[0])))
 
     def _away(self, key: str) -> float:
         """How far a setting lies above (+) or below (-) the shipped one."""
-        return _distance(self.own.get(key), self.usual.get(key))
+        own, usual = self.own.get(key), self.usual.get(key)
+        if key == "gamma" and isinstance(own, int | float) and isinstance(usual, int | float):
+            # the inverse of the steps that it looks ahead
+            return float(np.clip(_distance(1 - usual, 1 - own), -MOST_OF_GAMMA, MOST_OF_GAMMA))
+        return _distance(own, usual)
 
     def _objective(self) -> Iterator[_Change]:
-        """Training on the task as it is, a discount nearer to 1, higher initial values."""
+        """Training on the task as it is, another discount, other initial values."""
         own, found, task = self.own, self.found, self.found.task
         values, before = found.own_values, found.for_discount
         differs = {VARIANT[0]: bool(training_changes(self.spec)), VARIANT[1]: True}
-        if changed := [key for key in VARIANT if own.get(key) and differs[key]]:
-            odd, share = sum(own[key] != self.usual.get(key) for key in changed), 0.0
-            if task is not None and before is not None:
-                share = self._gain(found.model, task.discount, before)
-            yield dict.fromkeys(changed), odd + 8 * self.out_of_reach, share
+        changed = [key for key in VARIANT if own.get(key) and differs[key]]
+        share = 0.0
+        if changed and task is not None and before is not None:
+            share = self._gain(found.model, task.discount, before)
+        if odd := [key for key in VARIANT if key in self.odd]:
+            change = {key: self.usual.get(key) for key in odd}
+            yield change, len(odd) + 8 * self.out_of_reach, share
+        if kept := [key for key in changed if key not in odd]:
+            weight = 0.1 * self.is_network + 8 * self.out_of_reach
+            yield dict.fromkeys(kept), weight, 0.0 if odd else share
         if task is None or values is None:
             return
         nearer = round(1 - 0.5 / found.horizon, 7)
+        if self.odd.get("gamma", 0.0) > 0:
+            yield {"gamma": self.usual["gamma"]}, 0.15 * self.odd["gamma"], 0.0
         if "gamma" in self.known and task.discount < nearer:
-            weight = 4.0 * (STANDS_STILL[0] <= self._standing_still(task) <= STANDS_STILL[1])
+            # An agent that explores too much, or lacks steps, may value the start so as well.
+            away = max(-self._away("gamma"), 0.0)
+            own_start, best_start = self._standing_still(task, values)
+            stands = STANDS_STILL[0] <= own_start <= STANDS_STILL[1] and best_start > HARDLY_MORE
+            stands = stands and ("gamma" in self.odd or not self.is_entry)
+            weight = 4.0 * stands + 0.15 * away
             yield {"gamma": "auto"}, weight, self._gain(task.lived, nearer, values)
         if "initial_q" in self.known:
             best = values.max(axis=1)[task.model.reachable]
@@ -175,21 +246,29 @@ class _Case:
             high = usual if usual > own["initial_q"] else high
             # Values below all true ones hide every action that was not tried.
             far = (best.min() - own["initial_q"]) / max(np.ptp(best), TIE)
-            weight = self.starved + self.lost.get("never tried", 0.0) + min(max(far, 0.0), 4.0)
+            weight = (self.starved + self.lost.get("never tried", 0.0)) / (1 + 2 * self.short)
+            weight += min(max(far, 0.0), 4.0) * ("initial_q" in self.odd)
             if high > own["initial_q"]:
                 yield {"initial_q": high}, (1 - self.out_of_reach) * weight, 0.0
+            # Values far above all true ones take many updates to fall.
+            above = (own["initial_q"] - best.max()) / max(np.ptp(best), TIE)
+            if above > 1 and usual < own["initial_q"]:
+                yield {"initial_q": usual}, min(above, 4.0), 0.0
 
-    def _standing_still(self, task: Task) -> float:
-        """The agent's start value divided by that of standing still; 0 if free or unknown."""
+    def _standing_still(self, task: Task, best: Floats) -> tuple[float, float]:
+        """Its start value, and the best, divided by that of standing still; 0 if unknown."""
         model, tables = task.model, getattr(self.found.agent.policy, "q_tables", None)
         stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated
         stays &= (model.prob > 0) & model.reachable[:, None, None]
         observations = self.found.evaluator.observations
         if tables is None or not stays.any() or task.discount >= 1 or observations.ndim != 1:
-            return 0.0
+            return 0.0, 0.0
         standing = float(model.reward[stays].max()) / (1 - task.discount)
-        values = tables.numpy().mean(axis=0)[observations].max(axis=1)
-        return float(model.initial @ values) / standing if standing < 0 else 0.0
+        if standing >= 0:
+            return 0.0, 0.0
+        own = tables.numpy().mean(axis=0)[observations]
+        own_start, best_start = (float(model.initial @ q.max(axis=1)) for q in (own, best))
+        return own_start / standing, best_start / standing
 
     def _gain(self, model: TransitionModel, discount: float, before: Floats) -> float:
         """The share of the gap that planning with another model or discount closes."""
@@ -206,18 +285,23 @@ class _Case:
             returns.append(played.expected_return)
         return (returns[0] - returns[1]) / self.gap
 
+    def _budgets(self) -> tuple[float, float]:
+        """The run's steps or episodes, and the shipped ones in the same unit."""
+        steps = max(self.found.agent.num_timesteps, 1)
+        key = EPISODES if self.own.get(EPISODES) else STEPS
+        now = self.own.get(key) or steps
+        return now, self.usual.get(key) or (self.usual.get(STEPS) or 0) * now / steps
+
     def _budget(self) -> Iterator[_Change]:
         """More steps or episodes: four times as many, and at least the shipped ones."""
-        key = EPISODES if self.own.get(EPISODES) else STEPS
-        steps = max(self.found.agent.num_timesteps, 1)
-        now = self.own.get(key) or steps
-        usual = self.usual.get(key) or (self.usual.get(STEPS) or 0) * now / steps
+        now, usual = self._budgets()
         more = int(float(f"{max(FACTOR * now, usual):.2g}"))
-        weight = 0.4 + 0.5 * max(np.log(max(usual, 1) / now), 0.0)
+        weight = 0.4 + 0.5 * self.short
         if not self.is_network:
             fed = self._lacking(self.updates) - self._lacking(self.updates * more / now)
             weight += 2 * fed + 3 * self.unlearnt
-        yield {key: more}, weight * (1 - 0.7 * self.starved), 0.0
+        weight *= (1 - 0.7 * self.starved) * (1 - self.out_of_reach) * (not self.is_blind)
+        yield {EPISODES if self.own.get(EPISODES) else STEPS: more}, weight, 0.0
 
     def _step_size(self, rates: Floats) -> Iterator[_Change]:
         """A larger step size, and, for a network or against noise, a smaller or falling one."""
@@ -227,16 +311,24 @@ class _Case:
         larger = (
             usual if more > DIFFERENT else _scaled(own, FACTOR, np.inf if self.is_network else 1)
         )
-        base = 0.2 if self.is_network else 2 * self.unlearnt
-        if _distance(larger, own) > 0:
+        # A table that lacks steps or exploration learns no more with larger ones.
+        base = 2 * self.unlearnt * (1 - self.starved) * (not self.is_blind) / (1 + 4 * self.short)
+        base = 0.2 if self.is_network else base
+        if _distance(larger, own) > 0 and away < DIFFERENT:
             yield {key: larger}, base * (1 + 2 * more) + 0.3 * more, 0.0
-        if self.is_network:
+        if self.is_network and more < DIFFERENT:
             smaller = usual if away > DIFFERENT else _scaled(own, 1 / FACTOR)
             yield {key: smaller}, 0.3 + 0.7 * max(away, 0.0), 0.0
-        elif rates[-1] > 0 and (self.has_errors or "exploring" in self.lost):
+        elif (
+            not self.is_network
+            and rates[-1] > 0
+            and (self.has_errors or self.lost.get("exploring"))
+        ):
             ends, falls = _course(usual), f"exp_{rates.max():.2g}_{rates[-1] / 10:.2g}"
             lower = np.log(rates[-1] / ends[-1]) if ends is not None and ends[-1] > 0 else 0.0
-            yield {key: usual if lower > DIFFERENT else falls}, 0.1 + max(lower, 0.0), 0.0
+            settled = (1 - self.unlearnt) * (1 - self.starved) * min(10 * rates[-1], 1.0)
+            weight = 0.1 + max(lower, 0.0) + settled * (self.has_errors and self.short < DIFFERENT)
+            yield {key: usual if lower > DIFFERENT else falls}, weight, 0.0
 
     def _exploration(self) -> Iterator[_Change]:
         """More exploration and less, by epsilon, a temperature, noise or a bonus for entropy."""
@@ -261,8 +353,12 @@ class _Case:
             if then is None or np.allclose(then, self.epsilons):
                 continue
             away = abs(_distance(then.mean() + 0.01, self.epsilons.mean() + 0.01))
-            fed = max(self._lacking(self.updates) - self._lacking(self._expected(then)), 0.0)
-            weight = (1 - self.out_of_reach) * 3 * fed + (away if change is usual else 0.0)
+            lacks = self._lacking(self._expected(then))
+            fed = max(self._lacking(self.updates) - lacks, 0.0)
+            is_more = then.mean() > self.epsilons.mean()
+            away *= (1 - lacks * is_more) * (change is usual)
+            weight = (1 - self.out_of_reach) * 3 * fed + away
+            weight += 0.5 * (self.is_blind and then.mean() > RARELY)
             share = self.lost.get("exploring", 0.0) if then[-1] < self.epsilons[-1] else 0.0
             yield change, weight, share
 
@@ -342,6 +438,11 @@ def _scaled(value: Any, factor: float, most: float = np.inf) -> Any:
         return float(f"{min(factor * value, most):.3g}")
     kind, *ends = value.split("_")
     return "_".join([kind, *(f"{min(factor * float(end), most):.3g}" for end in ends)])
+
+
+def _typed(change: Mapping[str, Any]) -> str:
+    """A change as ``--test`` takes it."""
+    return " ".join(f"{key}:{_text(value)}" for key, value in change.items())
 
 
 def _text(value: Any) -> str:

@@ -35,20 +35,35 @@ CAUSES = [
 ]
 
 
+HIGH = {"initial_q": 1000.0, "learning_rate": 0.05, "n_timesteps": 100_000}
+
+# Likewise, and the settings that none of the changes may touch.
+INNOCENT = [
+    ("qlearning", TAXI, {"n_timesteps": 10_000}, ("learning_rate", "gamma", "exploration")),
+    ("qlearning", LAKE, NO_EPSILON, ("n_timesteps", "learning_rate")),
+    ("qlearning", WAREHOUSE, HASTY, ("n_timesteps", "initial_q", "exploration")),
+]
+
+
 def shipped(algo, env_id, change):
     """The spec with shipped settings, but for a change."""
     entry = {**override(read_entry(algo, env_id), change), "engine": "auto"}
     return read_spec(algo, env_id, entry, device="cpu")
 
 
-def proposals_of(algo, env_id, change=None, steps=None):
-    """The proposals for an agent with shipped settings, but for a change, after its training."""
+def explained(algo, env_id, change=None, steps=None):
+    """Of an agent with shipped settings, but for a change, after its training."""
     spec = shipped(algo, env_id, change or {})
     agent = make_agent(spec, None)
     if steps and algo != "ppo":  # too few to compile for
         agent.engine = "interpreted"
     agent.learn(steps or spec.n_timesteps)
-    return explanation(spec, agent, exact_evaluator(spec)).proposals
+    return explanation(spec, agent, exact_evaluator(spec))
+
+
+def proposals_of(algo, env_id, change=None, steps=None):
+    """The proposals of `explained`."""
+    return explained(algo, env_id, change, steps).proposals
 
 
 def test_the_right_change_is_first_or_second_for_eight_of_ten_causes():
@@ -82,6 +97,31 @@ def test_every_proposal_changes_a_setting_that_the_agent_has(algo, env_id, chang
         after = read_spec(algo, env_id, override(before, typed))
         assert after.hyperparams != before, one
         make_agent(after, None)  # it accepts these settings
+
+
+@pytest.mark.parametrize(("algo", "env_id", "change", "innocent"), INNOCENT)
+def test_no_proposal_blames_settings_that_are_as_shipped(algo, env_id, change, innocent):
+    found = proposals_of(algo, env_id, change)
+    assert found
+    assert not [one for one in " ".join(found).split() if one.startswith(innocent)], found
+
+
+@pytest.mark.parametrize(
+    ("algo", "env_id", "change"),
+    [
+        ("qlearning", TAXI, HIGH),
+        ("qlearning", TAXI, {"learning_rate": 0.005, "gamma": 0.5}),  # two causes at once
+        ("qlearning", LAKE, {"learning_rate": 0.9, "gamma": 0.6}),
+    ],
+)
+def test_the_first_or_the_second_proposal_mends_a_cause(algo, env_id, change):
+    before = explained(algo, env_id, change)
+    budget = {key: change[key] for key in ("n_timesteps",) if key in change}
+    good = explained(algo, env_id, budget).value
+    typed = [parse_assignments(one.split(), "--test") for one in before.proposals[:2]]
+    after = [explained(algo, env_id, override(change, one)).value for one in typed]
+    assert max(after) >= (before.value + good) / 2
+    assert before.value not in after
 
 
 def test_networks_are_also_offered_a_larger_one_and_the_unchanged_task():
