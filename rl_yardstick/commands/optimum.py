@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
-from rl_yardstick.commands.cli import OneLineParser, flag, shared
+from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -27,8 +27,12 @@ def build_parser() -> OneLineParser:
     """The flags."""
     words = "Compute the highest expected return of any policy, exactly."
     told = flag("--env", "environment id, or module:Class", required=True, metavar="ID")
+    own = (
+        several("--ignore", "attributes that change nothing", "NAME"),
+        several("--starts", "seeds of the only starts, equally likely", "SEED", type=cli.SEED),
+    )
     common = shared("--env-kwargs", "--gym-packages", "--model", "--json")
-    return OneLineParser(words, EPILOG, {"": [told, *common]})
+    return OneLineParser(words, EPILOG, {"": [told, *common, *own]})
 
 
 def main() -> int:
@@ -36,6 +40,9 @@ def main() -> int:
     args = build_parser().parse_args()
     cli.import_typed(args)
     cli.register_typed(args)
+    from rl_yardstick.envs import found_models
+
+    found_models.limit(args.exact_model, args.ignore, args.starts)
     from rl_yardstick.commands.terminal import say, table_console
     from rl_yardstick.pipeline.files import write_json
     from rl_yardstick.pipeline.settings import parse_assignments

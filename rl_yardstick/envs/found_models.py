@@ -12,7 +12,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, fields
@@ -42,23 +42,28 @@ SECONDS_OF_REFUSALS = 86_400.0  # on a slow day, a search may run out of time
 
 
 class Limits(NamedTuple):
-    """How long a search may take, and how many states it may find."""
+    """How long a search may take, how many states it may find, and what it may leave out."""
 
     seconds: float = 10.0
     states: int = 100_000
+    ignored: tuple[str, ...] = ()  # names of attributes that change nothing
+    starts: tuple[int, ...] = ()  # seeds of `reset`, equally likely; all starts if there are none
 
 
 _limits: ContextVar[Limits | None] = ContextVar("limits", default=Limits())  # noqa: B039 (never changes)
 
 
-def limit(text: str) -> None:
+def limit(text: str, ignored: Sequence[str] = (), starts: Sequence[int] = ()) -> None:
     """Search from now on within the usual limits (``auto``), up to a number of states, or never.
 
     Args:
         text: ``auto``, a number such as ``1000000``, or ``none``.
+        ignored: names of attributes that change nothing.
+        starts: seeds of `reset`, each of which is equally likely; empty for all starts.
     """
-    usual = {"auto": Limits(), "none": None}
-    _limits.set(usual[text] if text in usual else Limits(math.inf, int(text)))
+    most = Limits() if text in {"auto", "none"} else Limits(math.inf, int(text))
+    chosen = most._replace(ignored=tuple(ignored), starts=tuple(starts))
+    _limits.set(None if text == "none" else chosen)
 
 
 def limits() -> Limits | None:
@@ -140,7 +145,14 @@ def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
             print(f"looking for the exact model of {env}: {most}", file=sys.stderr, flush=True)  # noqa: T201
 
     try:
-        found = model_of(env, seconds=limits.seconds, max_states=limits.states, progress=progress)
+        found = model_of(
+            env,
+            seconds=limits.seconds,
+            max_states=limits.states,
+            ignore=limits.ignored,
+            starts=limits.starts or None,
+            progress=progress,
+        )
     except NotFinite as error:
         if isinstance(error, Unfinished):
             more = f"--model {10 * limits.states} to continue"
