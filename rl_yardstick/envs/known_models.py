@@ -70,7 +70,7 @@ def transition_model(env: Env) -> TransitionModel | None:
     where it gives its reward at terminations only. A time limit is no part of the model: see
     `time_limit`. None where the model is not known.
     """
-    _, wrappers = _layers(env)
+    _, wrappers = layers(env)
     claim = _believed(env)
     if claim is None:
         return None
@@ -97,19 +97,19 @@ def model_check(env: Env) -> ModelCheck | None:
 
     Trusted environments pass without a check. None where there is no model, or wrappers hide it.
     """
-    base, wrappers = _layers(env)
-    return _judged(base)[1] if all(map(_folds, wrappers)) else None
+    base, wrappers = layers(env)
+    return _judged(base)[1] if all(map(folds, wrappers)) else None
 
 
 def unknown_wrapper(env: Env) -> str | None:
     """The innermost wrapper that hides the model, by its class; None where none does."""
-    wrappers = (type(wrapper) for wrapper in _layers(env)[1] if not _folds(wrapper))
+    wrappers = (type(wrapper) for wrapper in layers(env)[1] if not folds(wrapper))
     return next((f"{kind.__module__}.{kind.__qualname__}" for kind in wrappers), None)
 
 
 def time_limit(env: Env) -> int | None:
     """The number of steps after which an episode is cut off, None where there is no limit."""
-    _, wrappers = _layers(env)
+    _, wrappers = layers(env)
     limits = [w._max_episode_steps for w in wrappers if isinstance(w, gym.wrappers.TimeLimit)]
     return min(limits, default=None)
 
@@ -144,7 +144,7 @@ def observations_of_states(env: Env) -> NDArray[Any] | None:
     """The observation of each state of `transition_model`; None where it is not known."""
     claim = _believed(env)
     observations = None if claim is None else claim.observations
-    for wrapper in _layers(env)[1]:
+    for wrapper in layers(env)[1]:
         if observations is not None and isinstance(wrapper, OBSERVATION_WRAPPERS):
             observations = wrapper.map_observations(observations)
     return observations
@@ -156,8 +156,8 @@ def action_masks_of_states(env: Env) -> Bools | None:
     Known for this project's environments, Gymnasium's Taxi, and `IdleActionMasks`, under the
     wrappers that `transition_model` knows; None elsewhere.
     """
-    base, wrappers = _layers(env)
-    if not all(map(_folds, wrappers)):
+    base, wrappers = layers(env)
+    if not all(map(folds, wrappers)):
         return None
     idle = [wrapper.masks for wrapper in wrappers if isinstance(wrapper, IdleActionMasks)]
     if idle:
@@ -174,7 +174,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
     return None
 
 
-def _layers(env: Env) -> tuple[Env, list[Wrapper]]:
+def layers(env: Env) -> tuple[Env, list[Wrapper]]:
     """The environment without its wrappers, and the wrappers, the innermost first."""
     wrappers = []
     while isinstance(env, gym.Wrapper):
@@ -183,7 +183,7 @@ def _layers(env: Env) -> tuple[Env, list[Wrapper]]:
     return env, wrappers[::-1]
 
 
-def _folds(wrapper: Wrapper) -> bool:
+def folds(wrapper: Wrapper) -> bool:
     """Whether a wrapper keeps the states, and changes rewards at most in a known way."""
     if type(wrapper) is TerminationReward:
         return not wrapper.on_truncation
@@ -199,8 +199,8 @@ def _folds(wrapper: Wrapper) -> bool:
 
 def _believed(env: Env) -> Claim | None:
     """The environment's claim about its dynamics, if it is accepted and no wrapper hides it."""
-    base, wrappers = _layers(env)
-    if not all(map(_folds, wrappers)):
+    base, wrappers = layers(env)
+    if not all(map(folds, wrappers)):
         return None
     claim, check = _judged(base)
     return claim if check is not None and check.refusal is None else None

@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from rl_yardstick import mdp
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs import known_models
+from rl_yardstick.envs.cut_world import cut_world
 from rl_yardstick.envs.layout import GridLayout, grid_layout
 from rl_yardstick.mdp.beliefs import Bracket, memory_optimum
 from rl_yardstick.mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats
-from rl_yardstick.pipeline.environments import kwargs_of, make_single_env
+from rl_yardstick.pipeline.environments import kwargs_of, make_single_env, training_changes
 from rl_yardstick.pipeline.evaluation.yardstick import (
     FAILED,
     Evaluation,
@@ -319,6 +320,27 @@ def evaluator_in(env: gym.Env[Any, Any]) -> ExactEvaluator | None:
     scale = hidden_scale(model, observations, horizon, optimum, baseline)
     yardstick = Yardstick(optimum, baseline) if scale is None else scale.yardstick(False)
     return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks, scale)
+
+
+def figures_of_bins(spec: TrainSpec, agent: BaseAlgorithm) -> tuple[float, float, int] | None:
+    """The return of an agent's greedy policy in its cut world, the optimum there, and the bins.
+
+    None if observations are not cut into bins, or the figures are not known: see `envs.cut_world`.
+    """
+    from rl_yardstick.agents import policies
+
+    if is_wrapped_as_vector(spec):
+        return None
+    world = None if training_changes(spec) else getattr(agent, "cut_world", None)
+    with closing(make_single_env(spec)) as env, suppress(ValueError):
+        horizon, world = known_models.time_limit(env), world or cut_world(env)
+    if world is None or horizon is None or (optimum := _optimum(world.model, horizon)) is None:
+        return None
+    bins, scale = np.arange(world.model.n_states), Yardstick(optimum, optimum)
+    evaluator = ExactEvaluator(world.model, bins, horizon, None, scale)
+    if evaluator.obstacle(agent) or policies.why_not_exact(agent, bins):
+        return None
+    return evaluator(agent).mean_return, optimum, len(bins)
 
 
 def _optimum(model: mdp.TransitionModel, horizon: int) -> float | None:
