@@ -23,7 +23,7 @@ from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
 from rl_yardstick.agents.common.given_spaces import in_given_spaces
 from rl_yardstick.agents.common.masks import numbers_in
 from rl_yardstick.agents.common.model_files import TablePolicy
-from rl_yardstick.envs.cut_world import CutWorld, cut_world
+from rl_yardstick.envs.cut_world import cut_world
 from rl_yardstick.envs.known_models import (
     action_masks_of_states,
     model_check,
@@ -133,11 +133,9 @@ class ActionTablePolicy(TablePolicy):
 class PlanningAgent(OnlineAlgorithm):
     """The base of the agents that plan.
 
-    Observations that are cut into bins have a model of their own, see `envs.cut_world`.
-
     Args:
         policy: ``"ActionTablePolicy"``.
-        env: environment whose transition model or `cut_world` is known, or its id.
+        env: environment whose transition model is known, or its bins' `cut_world`; or its id.
         gamma: discount factor of the planning; by default 1 for the optimum under the time
             limit, and 0.99 for the others.
         mask_actions: plan with only those actions that the environment allows in each state.
@@ -153,7 +151,9 @@ class PlanningAgent(OnlineAlgorithm):
     default_gamma: ClassVar[float] = 0.99
     planner: ClassVar[Callable[..., Any]]
     hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
-    cut_world: CutWorld | None = None  #: what was planned on, if observations are cut into bins
+    cut_world: TransitionModel | None = (
+        None  #: what was planned on, if observations are cut into bins
+    )
     excluded_from_states = ("cut_world",)
     _rebuilt = (*OnlineAlgorithm._rebuilt, "cut_world")
 
@@ -193,11 +193,10 @@ class PlanningAgent(OnlineAlgorithm):
         if model is None:
             try:
                 self.cut_world = cut_world(env)
-            except ValueError as error:
-                needs = "an environment whose attribute state can be set, as in classic control"
-                raise ValueError(f"{name} on bins needs {needs}: {error}") from error
-            if self.cut_world is not None:
-                model = self.cut_world.model
+            except (TypeError, ValueError) as error:  # of copying, and of what does not fit
+                where = "where the attribute state can be set, as in Gymnasium's classic control"
+                raise ValueError(f"{name} plans on bins {where}: {error}") from error
+            if (model := self.cut_world) is not None:
                 observations = np.arange(model.n_states)
         if model is None or observations is None:
             check = model_check(env)

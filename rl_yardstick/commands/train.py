@@ -361,8 +361,12 @@ def print_outcome(run: Run, spec: TrainSpec, outcome: Training, args: argparse.N
         results += [*result_lines(final), *(f"also     {line}" for line in others)]
     say(console, "\n".join(["", *results]) if results else "")
     exact = outcome.judge.exact
-    if final is not None and exact is None and (line := bins_line(spec, outcome)):
-        say(console, f"bins     {line}")
+    if final and exact is None:
+        from rl_yardstick.pipeline.evaluation.exact import told_of_bins
+
+        with console.status("computing the model of the bins"):
+            line = told_of_bins(spec, outcome.agent)
+        say(console, f"bins     {line}") if line else None
     if exact and final and (told := exact.instead(outcome.agent, final)):
         say(console, f"instead  {told}\nmore     docs/explain.md")
     say(console, "\n".join(["", *next_commands(run, spec, outcome.can_be_explained, args)]))
@@ -373,22 +377,6 @@ def print_outcome(run: Run, spec: TrainSpec, outcome: Training, args: argparse.N
         with console.status("writing the page that plays the training"):
             words = write_learning_page(spec, outcome.watch, page)
         say(console, f"learning {words}: {page.as_uri()}")
-
-
-def bins_line(spec: TrainSpec, outcome: Training) -> str | None:
-    """The figures of the cut world, if observations are cut into bins."""
-    from rl_yardstick.commands.terminal import figures
-    from rl_yardstick.pipeline.evaluation.exact import figures_of_bins
-
-    with outcome.run.console.status("computing the model of the bins"):
-        found = figures_of_bins(spec, outcome.agent)
-    if found is None:
-        return None
-    mine, optimum = figures(*found[:2])
-    return (
-        f"in the cut world of {found[2]:,} bins the policy returns {mine}, the optimum of the cut "
-        f"world is {optimum}; neither bounds the return in {spec.env_id}"
-    )
 
 
 def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:

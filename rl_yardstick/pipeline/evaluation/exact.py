@@ -322,25 +322,22 @@ def evaluator_in(env: gym.Env[Any, Any]) -> ExactEvaluator | None:
     return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks, scale)
 
 
-def figures_of_bins(spec: TrainSpec, agent: BaseAlgorithm) -> tuple[float, float, int] | None:
-    """The return of an agent's greedy policy in its cut world, the optimum there, and the bins.
-
-    None if observations are not cut into bins, or the figures are not known: see `envs.cut_world`.
-    """
+def told_of_bins(spec: TrainSpec, agent: BaseAlgorithm) -> str | None:
+    """The return of the greedy policy and the optimum in `cut_world`; None if these are unknown."""
     from rl_yardstick.agents import policies
 
-    if is_wrapped_as_vector(spec):
+    model = None if training_changes(spec) else getattr(agent, "cut_world", None)
+    with closing(make_single_env(spec)) as env, suppress(TypeError, ValueError):
+        horizon, model = known_models.time_limit(env), model or cut_world(env)
+    if model is None or horizon is None or (optimum := _optimum(model, horizon)) is None:
         return None
-    world = None if training_changes(spec) else getattr(agent, "cut_world", None)
-    with closing(make_single_env(spec)) as env, suppress(ValueError):
-        horizon, world = known_models.time_limit(env), world or cut_world(env)
-    if world is None or horizon is None or (optimum := _optimum(world.model, horizon)) is None:
+    bins, scale = np.arange(model.n_states), Yardstick(optimum, optimum)
+    evaluator = ExactEvaluator(model, bins, horizon, None, scale)
+    unknown = is_wrapped_as_vector(spec) or evaluator.obstacle(agent)
+    if unknown or policies.why_not_exact(agent, bins):
         return None
-    bins, scale = np.arange(world.model.n_states), Yardstick(optimum, optimum)
-    evaluator = ExactEvaluator(world.model, bins, horizon, None, scale)
-    if evaluator.obstacle(agent) or policies.why_not_exact(agent, bins):
-        return None
-    return evaluator(agent).mean_return, optimum, len(bins)
+    mine = f"return {evaluator(agent).mean_return:.4g} in the cut world of {len(bins):,} bins"
+    return f"{mine}, whose optimum is {optimum:.4g}; neither bounds the return in {spec.env_id}"
 
 
 def _optimum(model: mdp.TransitionModel, horizon: int) -> float | None:
