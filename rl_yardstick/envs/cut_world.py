@@ -19,7 +19,6 @@ from rl_yardstick.envs.known_models import TRANSPARENT_WRAPPERS, folds, layers
 from rl_yardstick.envs.wrappers import DiscretizeObservation
 from rl_yardstick.mdp.transition_model import Floats, Ints, TransitionModel
 
-State = tuple[float, ...]
 Step = tuple[int, float, bool]  # the bin reached, the reward, whether the episode terminates
 
 MOST_BINS = 500_000
@@ -46,7 +45,9 @@ def cut_world(env: gym.Env[Any, Any]) -> TransitionModel | None:
     stepper.check()
     starts = np.array([stepper.start() for _ in range(N_STARTS)])
     initial = np.bincount(stepper.bins_of(starts), minlength=stepper.n_bins) / N_STARTS
-    steps = stepper.steps_from(stepper.points(starts))
+    points = stepper.points(starts)
+    without = ~np.isin(stepper.bins_of(starts), stepper.bins_of(points))
+    steps = stepper.steps_from(np.concatenate((points, starts[without])))
     return _mean_model(np.reshape(steps, (-1, 4)), initial, stepper.n_actions)
 
 
@@ -68,17 +69,17 @@ class _Stepper:
         self.first: Any = np.asarray(getattr(self.base, "state", None))
         self.n_angles = len(self.cut.env.observation_space.sample()) - self.first.size
 
-    def state(self) -> State:
+    def state(self) -> tuple[float, ...]:
         """The present state."""
         return tuple(np.ravel(self.base.state).astype(np.float64).tolist())
 
-    def start(self) -> State:
+    def start(self) -> tuple[float, ...]:
         """Begin an episode; its first state."""
         self.env.reset()
         self.is_over = False
         return self.state()
 
-    def step(self, action: int, state: State | None = None) -> Step:
+    def step(self, action: int, state: tuple[float, ...] | None = None) -> Step:
         """One step from a state, or from the present one."""
         if self.is_over:
             self.start()

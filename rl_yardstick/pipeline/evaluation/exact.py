@@ -336,8 +336,8 @@ def told_of_bins(spec: TrainSpec, agent: BaseAlgorithm) -> str | None:
     unknown = is_wrapped_as_vector(spec) or evaluator.obstacle(agent)
     if unknown or policies.why_not_exact(agent, bins):
         return None
-    mine = f"return {evaluator(agent).mean_return:.4g} in the cut world of {len(bins):,} bins"
-    return f"{mine}, whose optimum is {optimum:.4g}; neither bounds the return in {spec.env_id}"
+    mine = f"return {evaluator(agent).mean_return:.2f} in the cut world of {len(bins):,} bins"
+    return f"{mine}, whose optimum is {optimum:.2f}; neither bounds the return in {spec.env_id}"
 
 
 def _optimum(model: mdp.TransitionModel, horizon: int) -> float | None:
