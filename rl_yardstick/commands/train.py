@@ -361,7 +361,7 @@ def print_outcome(run: Run, spec: TrainSpec, outcome: Training, args: argparse.N
         results += [*result_lines(final), *(f"also     {line}" for line in others)]
     say(console, "\n".join(["", *results]) if results else "")
     exact = outcome.judge.exact
-    if final and exact is None:
+    if final and exact is None and hasattr(outcome.agent.observation_space, "n"):
         from rl_yardstick.pipeline.evaluation.exact import told_of_bins
 
         with console.status("computing the model of the bins"):
