@@ -23,6 +23,7 @@ from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
 from rl_yardstick.agents.common.given_spaces import in_given_spaces
 from rl_yardstick.agents.common.masks import numbers_in
 from rl_yardstick.agents.common.model_files import TablePolicy
+from rl_yardstick.envs.cut_world import cut_world
 from rl_yardstick.envs.known_models import (
     action_masks_of_states,
     model_check,
@@ -134,7 +135,7 @@ class PlanningAgent(OnlineAlgorithm):
 
     Args:
         policy: ``"ActionTablePolicy"``.
-        env: environment whose transition model is known, or its id.
+        env: environment whose transition model is known, or its bins' `cut_world`; or its id.
         gamma: discount factor of the planning; by default 1 for the optimum under the time
             limit, and 0.99 for the others.
         mask_actions: plan with only those actions that the environment allows in each state.
@@ -150,6 +151,11 @@ class PlanningAgent(OnlineAlgorithm):
     default_gamma: ClassVar[float] = 0.99
     planner: ClassVar[Callable[..., Any]]
     hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
+    cut_world: TransitionModel | None = (
+        None  #: what was planned on, if observations are cut into bins
+    )
+    excluded_from_states = ("cut_world",)
+    _rebuilt = (*OnlineAlgorithm._rebuilt, "cut_world")
 
     def __init__(
         self,
@@ -184,6 +190,14 @@ class PlanningAgent(OnlineAlgorithm):
             raise ValueError(f"{name} needs environments in its own process: --vec-env dummy")
         env = vec_env.envs[0]
         model, observations = transition_model(env), observations_of_states(env)
+        if model is None:
+            try:
+                self.cut_world = cut_world(env)
+            except (TypeError, ValueError) as error:  # of copying, and of what does not fit
+                where = "where the attribute state can be set, as in Gymnasium's classic control"
+                raise ValueError(f"{name} plans on bins {where}: {error}") from error
+            if (model := self.cut_world) is not None:
+                observations = np.arange(model.n_states)
         if model is None or observations is None:
             check = model_check(env)
             why = "" if check is None or check.refusal is None else f": {check.refusal}"

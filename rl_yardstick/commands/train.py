@@ -369,6 +369,12 @@ def print_outcome(run: Run, spec: TrainSpec, outcome: Training, args: argparse.N
         results += [*result_lines(final), *(f"also     {line}" for line in others)]
     say(console, "\n".join(["", *results]) if results else "")
     exact = outcome.judge.exact
+    if final and exact is None and hasattr(outcome.agent.observation_space, "n"):
+        from rl_yardstick.pipeline.evaluation.exact import told_of_bins
+
+        with console.status("computing the model of the bins"):
+            line = told_of_bins(spec, outcome.agent)
+        say(console, f"bins     {line}") if line else None
     if exact and final and (told := exact.instead(outcome.agent, final)):
         say(console, f"instead  {told}\nmore     docs/explain.md")
     say(console, "\n".join(["", *next_commands(run, spec, outcome.can_be_explained, args)]))

@@ -74,7 +74,7 @@ def transition_model(env: Env) -> TransitionModel | None:
     ``P`` and ``initial_state_distrib`` as toy_text's do, and those in which a search finds it. A
     time limit is no part of the model: see `time_limit`. None where the model is not known.
     """
-    core, wrappers = _layers(env)
+    core, wrappers = _core_of(env)
     claim = _believed(core)
     if claim is None:
         return None
@@ -101,21 +101,19 @@ def model_check(env: Env) -> ModelCheck | None:
 
     Trusted environments pass without a test. Where no model was found, it says why.
     """
-    return _judged(_layers(env)[0])[1]
+    return _judged(_core_of(env)[0])[1]
 
 
 def found_claim(env: Env) -> FoundClaim | None:
     """What a search has found of an environment; None where the model is not from a search."""
-    claim = _judged(_layers(env)[0])[0]
+    claim = _judged(_core_of(env)[0])[0]
     return claim if isinstance(claim, FoundClaim) else None
 
 
 def time_limit(env: Env) -> int | None:
     """The number of steps after which an episode is cut off, None where there is no limit."""
-    limits, inside = list[int](), env
-    while isinstance(inside, gym.Wrapper):
-        limits += [inside._max_episode_steps] if isinstance(inside, gym.wrappers.TimeLimit) else []
-        inside = inside.env
+    wrappers = layers(env)[1]
+    limits = [w._max_episode_steps for w in wrappers if isinstance(w, gym.wrappers.TimeLimit)]
     if (claim := found_claim(env)) is not None and claim.horizon is not None:
         limits.append(claim.horizon)
     return min(limits, default=None)
@@ -129,7 +127,7 @@ def success_outcomes(env: Env) -> Bools | None:
     of FrozenLake and CliffWalking, the passenger delivered in Taxi. In Blackjack it is any win.
     None where the model is not known or no episode terminates.
     """
-    base, claim = env.unwrapped, _believed(_layers(env)[0])
+    base, claim = env.unwrapped, _believed(_core_of(env)[0])
     if claim is None:
         return None
     model = claim.model
@@ -149,7 +147,7 @@ def success_outcomes(env: Env) -> Bools | None:
 
 def observations_of_states(env: Env) -> NDArray[Any] | None:
     """The observation of each state of `transition_model`; None where it is not known."""
-    core, wrappers = _layers(env)
+    core, wrappers = _core_of(env)
     claim = _believed(core)
     observations = None if claim is None else claim.observations
     for wrapper in wrappers:
@@ -164,7 +162,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
     Known for this project's environments, Gymnasium's Taxi, and `IdleActionMasks`, under known
     wrappers, and where some actions raise an error; None elsewhere.
     """
-    core, wrappers = _layers(env)
+    core, wrappers = _core_of(env)
     idle = [wrapper.masks for wrapper in wrappers if isinstance(wrapper, IdleActionMasks)]
     if idle:
         return np.array(idle[-1])
@@ -183,19 +181,24 @@ def action_masks_of_states(env: Env) -> Bools | None:
     return None
 
 
-def _layers(env: Env) -> tuple[Env, list[Wrapper]]:
-    """The environment up to its outermost unknown wrapper; and those around, innermost first."""
+def layers(env: Env) -> tuple[Env, list[Wrapper]]:
+    """The environment without its wrappers, and the wrappers, the innermost first."""
     wrappers = []
     while isinstance(env, gym.Wrapper):
         wrappers.append(env)
         env = env.env
-    wrappers.reverse()
-    unknown = [place for place, wrapper in enumerate(wrappers, 1) if not _folds(wrapper)]
+    return env, wrappers[::-1]
+
+
+def _core_of(env: Env) -> tuple[Env, list[Wrapper]]:
+    """The environment up to its outermost unknown wrapper; and those around, innermost first."""
+    base, wrappers = layers(env)
+    unknown = [place for place, wrapper in enumerate(wrappers, 1) if not folds(wrapper)]
     n_inside = max(unknown, default=0)
-    return wrappers[n_inside - 1] if n_inside else env, wrappers[n_inside:]
+    return wrappers[n_inside - 1] if n_inside else base, wrappers[n_inside:]
 
 
-def _folds(wrapper: Wrapper) -> bool:
+def folds(wrapper: Wrapper) -> bool:
     """Whether a wrapper keeps the states, and changes rewards at most in a known way."""
     if type(wrapper) is TerminationReward:
         return not wrapper.on_truncation
@@ -218,7 +221,7 @@ def _believed(core: Env) -> Claim | FoundClaim | None:
 @contextmanager
 def one_look(env: Env) -> Iterator[None]:
     """Cache the model of ``env``, which must not change within the ``with`` statement."""
-    core = _layers(env)[0]
+    core = _core_of(env)[0]
     _looked_at[id(core)] = _judged(core)
     try:
         yield

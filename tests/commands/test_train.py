@@ -1,6 +1,7 @@
 """train.py as a user types it: output, files, signals, and the commands to type next."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -198,3 +199,20 @@ def test_a_run_is_tracked_in_weights_and_biases(type_command, tmp_path, monkeypa
         2,
         "train.py: error: --track needs: pip install 'rl-yardstick[wandb]'\n",
     )
+
+
+def test_agents_on_bins_print_their_return_in_the_cut_world(type_command):
+    wrapper = "rl_yardstick.envs.wrappers.DiscretizeObservation"
+    bins = ["-params", f"env_wrapper:{{{wrapper}: {{bins: 12}}}}", "gamma:1.0"]
+    found = {}
+    for algo in ("optimal", "qlearning"):
+        words = ["--algo", algo, "--env", "MountainCar-v0", "-n", "400", *bins]
+        code, out, _ = type_command("train.py", *words)
+        form = r"bins +return (\S+) in the cut world of 144 bins, whose optimum is (\S+); neither"
+        line = re.search(form, " ".join(out.split()))
+        assert code == 0
+        assert "optimum   -98.14 to -95.74" in out  # of the environment
+        found[algo] = [float(number) for number in line.groups()]
+    (planned, optimum), (learnt, same) = found["optimal"], found["qlearning"]
+    assert planned == optimum == same
+    assert -200 <= learnt < optimum

@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 from rl_yardstick import mdp
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs import found_models, known_models
+from rl_yardstick.envs.cut_world import cut_world
 from rl_yardstick.envs.found_models import FoundClaim
 from rl_yardstick.envs.layout import GridLayout, grid_layout
 from rl_yardstick.mdp.beliefs import Bracket, memory_optimum
 from rl_yardstick.mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats
-from rl_yardstick.pipeline.environments import kwargs_of, make_single_env
+from rl_yardstick.pipeline.environments import kwargs_of, make_single_env, training_changes
 from rl_yardstick.pipeline.evaluation.yardstick import (
     FAILED,
     Evaluation,
@@ -325,6 +326,24 @@ def evaluator_in(env: gym.Env[Any, Any]) -> ExactEvaluator | None:
     return ExactEvaluator(
         model, observations, horizon, success, yardstick, layout, masks, scale, found
     )
+
+
+def told_of_bins(spec: TrainSpec, agent: BaseAlgorithm) -> str | None:
+    """The return of the greedy policy and the optimum in `cut_world`; None if these are unknown."""
+    from rl_yardstick.agents import policies
+
+    model = None if training_changes(spec) else getattr(agent, "cut_world", None)
+    with closing(make_single_env(spec)) as env, suppress(TypeError, ValueError):
+        horizon, model = known_models.time_limit(env), model or cut_world(env)
+    if model is None or horizon is None or (optimum := _optimum(model, horizon)) is None:
+        return None
+    bins, scale = np.arange(model.n_states), Yardstick(optimum, optimum)
+    evaluator = ExactEvaluator(model, bins, horizon, None, scale)
+    unknown = is_wrapped_as_vector(spec) or evaluator.obstacle(agent)
+    if unknown or policies.why_not_exact(agent, bins):
+        return None
+    mine = f"return {evaluator(agent).mean_return:.2f} in the cut world of {len(bins):,} bins"
+    return f"{mine}, whose optimum is {optimum:.2f}; neither bounds the return in {spec.env_id}"
 
 
 def _optimum(model: mdp.TransitionModel, horizon: int) -> float | None:
