@@ -13,6 +13,7 @@ from rl_yardstick.pipeline.errors import UserError
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.subjects import Subject
 
+SPACES = ("discrete", "box")
 KINDS = ("q_learning", "off_policy_monte_carlo", "sarsa", "expected_sarsa", "actor_critic")
 
 EPILOG = """\
@@ -31,13 +32,11 @@ Exit code: 0 if it is right, 1 if it is wrong, 2 if it cannot be read.
 def build_parser() -> OneLineParser:
     """The flags."""
     words = "Measure the backup of an implementation, and name its fault if it has a known one."
-    spaces = ("discrete", "box")
     kinds = f"the kind of algorithm (default: as its class or name): {', '.join(KINDS)}"
     flags = (
         *shared("--gym-packages", "--hyperparams"),
         flag("--kind", kinds, choices=[*KINDS, "policy_gradient"], metavar="KIND"),
-        flag("--observations", "numbers or vectors (default: what works)", choices=spaces),
-        flag("--actions", "one of two, or a number (default: what works)", choices=spaces),
+        flag("--observations", "numbers or vectors (default: what works)", choices=SPACES),
         flag("--seeds", "trainings (default: 3, or 2 of networks)", whole_number(1, 100)),
         *shared("--json"),
     )
@@ -81,11 +80,10 @@ def subject_of(args: argparse.Namespace) -> Subject:
     from rl_yardstick.pipeline.components import module_name
 
     typed: dict[str, Any] = parse_assignments(args.hyperparams, "-params")
-    wanted = args.observations, args.actions
     if args.script is None:
         check_agent(args.algo)
-        return ClassSubject(args.algo, typed, args.kind, wanted)
+        return ClassSubject(args.algo, typed, args.kind, args.observations)
     function = getattr(sys.modules.get(module_name(module)), attribute, None)
     if not callable(function):
         raise UserError(f"--script takes module:function, and there is no function {args.script}")
-    return ScriptSubject(args.script, function, typed, args.kind, wanted)
+    return ScriptSubject(args.script, function, typed, args.kind, args.observations)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -19,7 +19,7 @@ from rl_yardstick.diagnosis.backups import (
     measured,
 )
 from rl_yardstick.diagnosis.composite_world import BETTER, END, GAMMA, N_STATES, Steps
-from rl_yardstick.diagnosis.subjects import KINDS, Subject, Trained
+from rl_yardstick.diagnosis.subjects import KINDS, Subject
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError, one_line
 
@@ -65,15 +65,12 @@ class Verdict:
     def as_json(self) -> dict[str, Any]:
         """The verdict as JSON."""
         words = {"right": "right", "wrong": "fault", "unreadable": "nothing can be said"}
-        return {
-            "algorithm": self.subject,
-            "verdict": words[self.state],
-            "fault": self.fault or None,
-            "target": self.target,
-            "measured": None if self.measured is None else self.measured._asdict(),
+        told: dict[str, Any] = {
+            "measured": self.measured and self.measured._asdict(),
             "notes": [*self.notes],
-            "not_seen": self.unseen,
         }
+        told |= {"fault": self.fault or None, "target": self.target, "not_seen": self.unseen}
+        return {"algorithm": self.subject, "verdict": words[self.state], **told}
 
 
 def audit(subject: Subject, seeds: int = 0) -> Verdict:
@@ -114,14 +111,13 @@ class Near(NamedTuple):
     name: str
 
 
-@dataclass
-class _Training:
+class _Training(NamedTuple):
     """The values that one seed learnt, and the log."""
 
     values: Floats
     first: Floats
-    steps: Steps = field(repr=False)
-    trained: Trained = field(repr=False)
+    steps: Steps
+    act: Callable[[int], int]
 
 
 def nearest(trainings: Sequence[_Training], rule: str) -> list[Near]:
@@ -180,7 +176,7 @@ class _ByValues:
             assert trained.values is not None
             assert begun.values is not None
             steps = Steps(trained.rows, late=0.35)
-            found.append(_Training(trained.values, begun.values, steps, trained))
+            found.append(_Training(trained.values, begun.values, steps, trained.act))
         return found
 
     def _by_rules(self, trainings: Sequence[_Training]) -> tuple[str, list[Near]]:
@@ -242,7 +238,7 @@ def _choices(trainings: Sequence[_Training]) -> tuple[str, str] | None:
         text = f"late in training it does the action that pays more in {share:.0%}"
         return None if share > 0.6 else ("advantage-sign" if share < 0.35 else "", text)
     asked = [
-        np.mean([one.trained.act(state) == BETTER[state] for _ in range(100)])
+        np.mean([one.act(state) == BETTER[state] for _ in range(100)])
         for one in trainings
         for state in (13, 14)
     ]

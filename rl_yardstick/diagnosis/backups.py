@@ -27,31 +27,41 @@ def backup(
     return lambda d, v: reward(d) + discount(d) * goes_on(d) * v(shown(d))
 
 
-def _in_next_episode(d: Steps) -> Ints:
-    return np.where(d.over > 0, d.next_state, d.shown)
+def at_truncation(cut: OfSteps, other: OfSteps) -> OfSteps:
+    """One thing where an episode is truncated, and another elsewhere."""
+    return lambda d: np.where(d.truncated > 0, cut(d), other(d))
 
 
-def _off_by_one(d: Steps) -> Floats:
-    return 1 - d.is_first
-
-
-def _beside_its_own(backup: Backup) -> Backup:
+def beside_its_own(backup: Backup) -> Backup:
     """As in rollouts whose truncated steps had their last value added to the reward."""
     return lambda d, v: d.truncated * GAMMA * v(d.shown) + backup(d, v)
 
 
-_LEAKS = backup(goes_on=lambda d: 1, shown=_in_next_episode)
-_LATE = backup(goes_on=_off_by_one, shown=_in_next_episode)
+def _next_episode(d: Steps) -> Ints:
+    return np.where(d.over > 0, d.next_state, d.shown)
+
+
+def _off(d: Steps) -> Floats:
+    return 1 - d.is_first
+
+
+_ONCE, _TWICE, _NOT, _SHOWN = (
+    (lambda d: GAMMA),
+    (lambda d: GAMMA**2),
+    (lambda d: 1),
+    (lambda d: d.shown),
+)
+_LEAKS, _LATE = backup(goes_on=_NOT, shown=_next_episode), backup(goes_on=_off, shown=_next_episode)
 _REWARDS: Mapping[str, OfSteps] = {
     "reward-clipped": lambda d: np.clip(d.reward, -1, 1),
     "reward-sign-only": lambda d: np.sign(d.reward),
     "reward-sign-flipped": lambda d: -d.reward,
     "reward-absolute": lambda d: np.abs(d.reward),
     "reward-squashed": lambda d: np.tanh(d.reward),
-    "reward-of-step-before": lambda d: np.roll(d.reward, 1),
-    "reward-of-step-after": lambda d: np.roll(d.reward, -1),
+    "reward-of-step-before": lambda d: d.reward_before,
+    "reward-of-step-after": lambda d: d.next_reward,
     "reward-missing-at-the-end": lambda d: np.where(d.over > 0, 0, d.reward),
-    "reward-missing-at-truncation": lambda d: np.where(d.truncated > 0, 0, d.reward),
+    "reward-missing-at-truncation": at_truncation(lambda d: 0, lambda d: d.reward),
     **{
         f"reward-scaled ({c:g})": lambda d, c=c: c * d.reward  # type: ignore[misc]
         for c in (0.01, 0.1, 0.5, 2.0, 10.0)
@@ -60,34 +70,28 @@ _REWARDS: Mapping[str, OfSteps] = {
 # What is in parentheses tells rows of one fault apart.
 BACKUPS: Mapping[str, Backup] = {
     RIGHT: backup(),
-    "bootstraps-at-terminal": backup(goes_on=lambda d: 1),
+    "bootstraps-at-terminal": backup(goes_on=_NOT),
     "no-bootstrap-at-truncation": backup(goes_on=lambda d: 1 - d.over),
-    "no-bootstrap-at-truncation (and none at an end but of the next episode)": backup(
-        goes_on=lambda d: 1 - d.truncated, shown=_in_next_episode
+    "no-bootstrap-at-truncation (leaks)": backup(
+        goes_on=lambda d: 1 - d.truncated, shown=_next_episode
     ),
     "bootstrap-mask-inverted": backup(goes_on=lambda d: 1 - d.truncated),
     "bootstraps-only-at-the-end": backup(goes_on=lambda d: d.over),
     "bootstraps-only-at-terminal": backup(goes_on=lambda d: d.terminated),
-    "reset-observation": backup(shown=lambda d: np.where(d.truncated > 0, d.next_state, d.shown)),
-    "own-state-at-truncation": backup(shown=lambda d: np.where(d.truncated > 0, d.state, d.shown)),
-    "truncation-undiscounted": backup(discount=lambda d: np.where(d.truncated > 0, 1, GAMMA)),
-    "truncation-discounted-twice": backup(
-        discount=lambda d: np.where(d.truncated > 0, GAMMA**2, GAMMA)
-    ),
-    "truncation-counted-twice": _beside_its_own(backup()),
+    "reset-observation": backup(shown=at_truncation(_next_episode, _SHOWN)),
+    "own-state-at-truncation": backup(shown=at_truncation(lambda d: d.state, _SHOWN)),
+    "truncation-undiscounted": backup(discount=at_truncation(_NOT, _ONCE)),
+    "truncation-discounted-twice": backup(discount=at_truncation(_TWICE, _ONCE)),
+    "truncation-counted-twice": beside_its_own(backup()),
     "next-episode-leaks": _LEAKS,
-    "next-episode-leaks (beside)": _beside_its_own(_LEAKS),
+    "next-episode-leaks (beside)": beside_its_own(_LEAKS),
     "done-flag-off-by-one": _LATE,
-    "done-flag-off-by-one (true end)": backup(goes_on=_off_by_one),
-    "done-flag-off-by-one (beside)": _beside_its_own(_LATE),
-    "discount-twice": backup(discount=lambda d: GAMMA**2),
-    "discount-twice (not at truncation)": backup(
-        discount=lambda d: np.where(d.truncated > 0, GAMMA, GAMMA**2)
-    ),
-    "discount-missing": backup(discount=lambda d: 1),
-    "discount-missing (not at truncation)": backup(
-        discount=lambda d: np.where(d.truncated > 0, GAMMA, 1)
-    ),
+    "done-flag-off-by-one (true end)": backup(goes_on=_off),
+    "done-flag-off-by-one (beside)": beside_its_own(_LATE),
+    "discount-twice": backup(discount=_TWICE),
+    "discount-twice (not at truncation)": backup(discount=at_truncation(_ONCE, _TWICE)),
+    "discount-missing": backup(discount=_NOT),
+    "discount-missing (not at truncation)": backup(discount=at_truncation(_ONCE, _NOT)),
     "discount-on-reward-too": backup(reward=lambda d: GAMMA * d.reward),
     "no-bootstrap": backup(goes_on=lambda d: 0),
     "no-bootstrap (but at truncation)": backup(goes_on=lambda d: d.truncated),
@@ -115,7 +119,6 @@ RULES: Mapping[str, Callable[[Floats, Steps, Ints], Floats]] = {
     "same": lambda q, d, states: q[states, d.action],
     "best-in-own-state": lambda q, d, states: q[states, q[d.state].argmax(axis=1)],
 }
-_WORDS = {"smallest": "minimises", "next": "follows", "expected": "follows", "largest": "maximises"}
 
 
 def next_values(q: Floats, d: Steps, rule: str) -> Values:
@@ -132,9 +135,10 @@ def fault_of(name: str) -> str:
 
 def name_of_rule(rule: str, right: str) -> str:
     """The fault of a learner whose next value is by this rule."""
-    if rule in ("largest", "next", "expected"):
-        return f"{_WORDS[rule]}-instead-of-{_WORDS[right]} ({rule})"
-    return f"next-value-is-{rule}"
+    if rule not in ("largest", "next", "expected"):
+        return f"next-value-is-{rule}"
+    ways = ("maximises", "follows") if rule == "largest" else ("follows", "maximises")
+    return f"{ways[0]}-instead-of-{ways[1]} ({rule})"
 
 
 # --- the values to which a formula leads ----------------------------------------------------------
@@ -216,10 +220,9 @@ def _of_actions(d: Steps, rule: str, own: Floats, first: Floats) -> Iterator[Can
         is_same = {wrong, rule} <= {"next", "expected"} or wrong == rule
         if not (is_same or (wrong == "mean" and rule != "largest" and d.exploration[-1] > 0.8)):
             yield solve(name_of_rule(wrong, rule), right, d, wrong, own)
-    for name, shift in (("action-of-step-before", 1), ("action-of-step-after", -1)):
-        other = copy.copy(d)
-        other.action = np.roll(d.action, shift)
-        yield solve(name, right, other, rule, own)
+    other = copy.copy(d)
+    for other.action in (d.action_before, d.next_action):
+        yield solve("action-of-another-step", right, other, rule, own)
     still = next_values(first, d, rule)
     yield solve("target-never-copied", lambda d, v: right(d, still), d, rule, own)
     everywhere = lambda d, v: np.full(len(d.state), np.average(right(d, v), weights=d.weight))  # noqa: E731

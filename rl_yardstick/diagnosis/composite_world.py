@@ -74,19 +74,16 @@ class CompositeWorld(gym.Env[Any, Any]):
     Args:
         log: to which each step is appended.
         is_discrete: whether observations are state numbers, and not vectors with a one.
-        is_continuous: whether an action is a number, which counts as action 1 above zero.
         first: the story that comes first.
         bump: the number of a step whose reward is 1 higher.
     """
 
-    def __init__(
-        self, log: list[Row], is_discrete: bool, is_continuous: bool, first: int, bump: int
-    ) -> None:
+    def __init__(self, log: list[Row], is_discrete: bool, first: int, bump: int) -> None:
         self.log, self.is_discrete, self.bump = log, is_discrete, bump
         self.story, self.place, self.round, self.state = first - 1, 0, 0, 0
-        vectors, number = spaces.Box(0, 1, (N_STATES,)), spaces.Box(-1, 1, (1,))
+        vectors = spaces.Box(0, 1, (N_STATES,))
         self.observation_space = spaces.Discrete(N_STATES) if is_discrete else vectors
-        self.action_space = number if is_continuous else spaces.Discrete(N_ACTIONS)
+        self.action_space = spaces.Discrete(N_ACTIONS)
 
     def observation_of(self, state: int) -> Any:
         """The observation of a state."""
@@ -109,7 +106,7 @@ class CompositeWorld(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Go on in the story."""
-        story, number = STORIES[self.story], action_number(action, self.action_space)
+        story, number = STORIES[self.story], int(np.asarray(action).reshape(-1)[0])
         reward = float(_PAYS[self.state][number]) + (len(self.log) == self.bump)
         self.place += 1
         is_over = self.place == len(story.states)
@@ -120,12 +117,6 @@ class CompositeWorld(gym.Env[Any, Any]):
         self.log.append((self.state, number, reward, shown, *ends))
         self.state = shown
         return self.observation_of(shown), reward, *ends, {}
-
-
-def action_number(action: Any, space: spaces.Space[Any]) -> int:
-    """0 or 1: the action itself, or the half of [-1, 1] in which it lies."""
-    number = np.asarray(action).reshape(-1)[0]
-    return int(number) if isinstance(space, spaces.Discrete) else int(number > 0)
 
 
 class Steps:
@@ -148,6 +139,7 @@ class Steps:
         self.weight = (np.arange(n) >= int(n * (1 - late))).astype(np.float64)
         self.next_state = np.roll(self.state, -1)  #: of the next step, also in the next episode
         self.next_action, self.action_before = np.roll(self.action, -1), np.roll(self.action, 1)
+        self.next_reward, self.reward_before = np.roll(self.reward, -1), np.roll(self.reward, 1)
         self.is_first: Floats = np.roll(self.over, 1)
         self.is_first[0] = 1.0
         choices = np.array([BETTER.get(state, -1) for state in range(N_STATES)])[self.state]
@@ -187,7 +179,6 @@ class Copies:
     """Makes copies of the world that begin with different stories, and holds their logs."""
 
     is_discrete: bool
-    is_continuous: bool = False
     bump: int = -1
     logs: list[list[Row]] = field(default_factory=list)
 
@@ -195,8 +186,7 @@ class Copies:
         """One more copy."""
         self.logs.append([])
         first = (len(self.logs) - 1) * 4 % len(STORIES)
-        kinds = self.is_discrete, self.is_continuous
-        return CompositeWorld(self.logs[-1], *kinds, first, self.bump)
+        return CompositeWorld(self.logs[-1], self.is_discrete, first, self.bump)
 
     @property
     def rows(self) -> list[Row]:

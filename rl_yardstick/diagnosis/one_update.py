@@ -205,7 +205,8 @@ class OfDQN:
             "gather-of-action-0": one[cell],
             "gather-of-action-1": one[cell + 1],
             "gather-of-the-other-action": one[cell + 1 - d.action],
-            "action-of-step-before": one[cell + d.action_before],
+            "action-of-another-step": one[cell + d.action_before],
+            "action-of-another-step (after)": one[cell + d.next_action],
             "trains-the-mean-of-actions": (one[cell] + one[cell + 1]) / 2,
         }
         for loss, most in (("huber", 1.0), ("mse", np.inf)):

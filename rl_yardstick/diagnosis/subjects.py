@@ -7,7 +7,6 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,8 +23,7 @@ from rl_yardstick.pipeline.components import (
 from rl_yardstick.pipeline.errors import UserError, one_line, unknown
 from rl_yardstick.pipeline.spec import validated
 
-SpaceKind = Literal["discrete", "box"]  # of observations, or of actions
-Spaces = tuple[SpaceKind | None, SpaceKind | None]
+SpaceKind = Literal["discrete", "box"]  # of observations
 
 # What an algorithm claims to be, and its next value: a rule of `backups`, or that of states.
 KINDS: Mapping[str, str] = {
@@ -36,20 +34,20 @@ KINDS: Mapping[str, str] = {
     "actor_critic": "states",
     "policy_gradient": "states",
 }
-_KIND_WORDS = (
-    ("expected_sarsa", r"expected[ _-]?sarsa"),
-    ("sarsa", r"sarsa"),
-    ("q_learning", r"q[ _-]?(learning|network|lambda)|dqn|qlearn"),
-    ("actor_critic", r"actor[ _-]?critic|a2c|ppo|reinforce|policy[ _-]gradient"),
-)
+_KIND_WORDS = {
+    "expected_sarsa": r"expected[ _-]?sarsa",
+    "sarsa": r"sarsa",
+    "q_learning": r"q[ _-]?(learning|network|lambda)|dqn|qlearn",
+    "actor_critic": r"actor[ _-]?critic|a2c|ppo|reinforce|policy[ _-]gradient",
+}
 
 
 def kind_of(*texts: str | None) -> str | None:
-    """The kind that a name or a docstring tells, the first that tells one."""
+    """The kind that a name or a docstring tells first."""
     for text in texts:
-        found = [(re.search(words, text or "", re.I), kind) for kind, words in _KIND_WORDS]
-        if places := [(match.start(), kind) for match, kind in found if match]:
-            return min(places, key=lambda place: place[0])[1]
+        found = {kind: re.search(words, text or "", re.I) for kind, words in _KIND_WORDS.items()}
+        if places := {kind: match.start() for kind, match in found.items() if match}:
+            return min(places, key=lambda kind: places[kind])
     return None
 
 
@@ -68,8 +66,8 @@ class Subject(ABC):
     kind: str | None = None  # one of `KINDS`; None if it is not known
     typed: Mapping[str, Any]  # settings that the user gave
     parameters: Mapping[str, inspect.Parameter]
-    spaces: tuple[SpaceKind, SpaceKind]  # the kinds of observations and actions
-    first_spaces: Sequence[SpaceKind] = ("box", "discrete")  # of observations, in this order
+    observes: SpaceKind  # the kind of observations
+    kinds: Sequence[SpaceKind] = ("box", "discrete")  # that are tried, in this order
 
     def __init__(self, name: str, kind: str | None) -> None:
         self.name, self.kind = name, kind
@@ -87,15 +85,14 @@ class Subject(ABC):
             bump: the number of a step whose reward is 1 higher.
             **changes: settings under the learner's names.
         """
-        copies = Copies(self.spaces[0] == "discrete", self.spaces[1] == "box", bump)
+        copies = Copies(self.observes == "discrete", bump)
         model = self.run(copies, seed, steps, changes)
         world = copies()
         shown = [world.observation_of(state) for state in range(N_STATES)]
 
         def act(state: int) -> int:
             action = model.predict(np.asarray(shown[state]), deterministic=True)[0]
-            number = np.asarray(action).reshape(-1)[0]
-            return int(number > 0) if self.spaces[1] == "box" else int(number)
+            return int(np.asarray(action).reshape(-1)[0])
 
         return Trained(values_of(model, shown), act, copies.rows, model)
 
@@ -103,12 +100,11 @@ class Subject(ABC):
         """The first of these settings that the learner has."""
         return next((name for name in names if name in self.parameters), None)
 
-    def find_spaces(self, wanted: Spaces) -> None:
-        """Take the first kinds of observations and actions that the learner can train on."""
+    def find_observations(self, wanted: SpaceKind | None) -> None:
+        """Take the first kind of observations that the learner can train on."""
         errors: list[str] = []
-        kinds = [self.first_spaces, ("discrete", "box")]
-        given = [kind if one is None else (one,) for kind, one in zip(kinds, wanted, strict=True)]
-        for self.spaces in product(*given):  # type: ignore[assignment]
+        for kind in self.kinds if wanted is None else (wanted,):
+            self.observes = kind
             try:
                 self.train(60, 0).act(0)
                 return
@@ -118,7 +114,7 @@ class Subject(ABC):
                 errors.append(f"{type(error).__name__}: {one_line(error)}")
         raise UserError(
             f"{self.name} cannot train on a tiny world: {'; '.join(dict.fromkeys(errors))} "
-            "(--observations and --actions set the kinds of its spaces)"
+            "(--observations sets their kind)"
         )
 
 
@@ -143,20 +139,19 @@ _ON_POLICY: Mapping[str, Any] = {
     "n_epochs": 10,
     "policy_kwargs": {"net_arch": {"pi": [32], "vf": [32]}},
 }
-_QUANTILES = {"policy_kwargs": {"net_arch": [32], "n_quantiles": 10}}
-_EXACT = {"bonus_scale": 1e-3, "known_after": 1}
-_FAMILIES: Mapping[str, tuple[str | None, Mapping[str, Any]]] = {
+_FAMILIES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     **dict.fromkeys(("NStepTreeBackup", "ExpectedSARSA"), ("expected_sarsa", {})),
     **dict.fromkeys(("NStepSARSA", "SARSALambda", "SARSA", "SemiGradientSARSA"), ("sarsa", {})),
     "MonteCarlo": ("sarsa", {"learning_rate": 0.1}),
-    "OptimisticAlgorithm": ("q_learning", _EXACT),
-    **dict.fromkeys(("QLambda", "QLearning", "PrioritizedSweeping"), ("q_learning", {})),
-    **dict.fromkeys(
-        ("OffPolicyMonteCarlo", "DoubleQLearning", "SemiGradientQ"), ("q_learning", {})
-    ),
+    "OptimisticAlgorithm": ("q_learning", {"bonus_scale": 1e-3, "known_after": 1}),
+    "TabularAlgorithm": ("q_learning", {}),
+    "SemiGradientQ": ("q_learning", {}),
     "ActorCritic": ("actor_critic", {}),
     "Reinforce": ("actor_critic", {"baseline": "value"}),
-    "QRDQN": ("q_learning", {**_OFF_POLICY, **_QUANTILES}),
+    "QRDQN": (
+        "q_learning",
+        {**_OFF_POLICY, "policy_kwargs": {"net_arch": [32], "n_quantiles": 10}},
+    ),
     "DQN": ("q_learning", _OFF_POLICY),
     "OnPolicyAlgorithm": ("actor_critic", _ON_POLICY),
 }
@@ -166,8 +161,8 @@ _EXPLORES = {"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0}
 class ClassSubject(Subject):
     """A subclass of Stable-Baselines3's `BaseAlgorithm`, or a plain class: an agent by name.
 
-    ``kind`` is what it claims to be (default: as its family or its name), ``wanted`` the kinds of
-    observations and actions (default: the first that works).
+    ``kind`` is what it claims to be (default: as its family or its name), ``wanted`` the kind of
+    observations (default: the first that works).
     """
 
     def __init__(
@@ -175,7 +170,7 @@ class ClassSubject(Subject):
         name: str,
         typed: Mapping[str, Any],
         kind: str | None = None,
-        wanted: Spaces = (None, None),
+        wanted: SpaceKind | None = None,
     ) -> None:
         super().__init__(name, kind)
         if ALGORITHMS[name].for_bandits:
@@ -197,11 +192,11 @@ class ClassSubject(Subject):
         told = kind_of(name.rpartition(".")[2], inspect.getdoc(plain or self.cls))
         self.kind, self.base = kind or claims or told, {**_EXPLORES, **settings}
         if plain is None:
-            self.first_spaces = ("discrete", "box")
+            self.kinds = ("discrete", "box")
         arguments = check_arguments(name, typed)
         spec = validated({"algo": name, "env_id": "", "algorithm": arguments})
         self.typed = constructor_arguments(spec, self.cls, is_dict=False)
-        self.find_spaces(wanted)
+        self.find_observations(wanted)
 
     def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
         from stable_baselines3.common.logger import Logger
@@ -246,7 +241,7 @@ class ScriptSubject(Subject):
         function: Callable[..., Any],
         typed: Mapping[str, Any],
         kind: str | None = None,
-        wanted: Spaces = (None, None),
+        wanted: SpaceKind | None = None,
     ) -> None:
         module: Any = inspect.getmodule(function)
         told = kind_of(name, inspect.getdoc(function), getattr(module, "__doc__", None))
@@ -265,7 +260,7 @@ class ScriptSubject(Subject):
         for key in typed:
             if not self.named(key):
                 raise unknown(f"-params: unknown argument of {name}", key, self.parameters)
-        self.find_spaces(wanted)
+        self.find_observations(wanted)
 
     def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
         settings: Any = {"seed": seed, "gamma": GAMMA, **deepcopy(dict(self.typed)), **changes}
