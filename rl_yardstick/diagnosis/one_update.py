@@ -25,7 +25,7 @@ from rl_yardstick.diagnosis.backups import (
     next_values,
     parts_of,
 )
-from rl_yardstick.diagnosis.composite_world import GAMMA, N_STATES, Copies, Steps
+from rl_yardstick.diagnosis.composite_world import GAMMA, N_STATES, Copies, Ints, Steps
 from rl_yardstick.diagnosis.subjects import ClassSubject, Subject
 from rl_yardstick.mdp.transition_model import Floats
 
@@ -96,7 +96,7 @@ class OfDQN:
         self.subject, n = subject, 180
         self.is_online = getattr(subject.cls, "target_kind", "") == "online"  # of the DQN of 2013
         settings = {"learning_starts": 10**6, "target_update_interval": 10**9}
-        self.model, copies = new_model(subject, buffer_size=n + 20, batch_size=64, **settings)
+        self.model, copies = new_model(subject, buffer_size=130, batch_size=64, **settings)
         self.model.learn(n)
         th.manual_seed(0)
         eye = th.eye(N_STATES)
@@ -112,11 +112,13 @@ class OfDQN:
         self.slopes = slopes(self.model.q_net, values)  # (2 S, P)
         self.q = values.detach().double().numpy()
         self.t = self.model.q_net_target(eye).detach().double().numpy()
-        self.batch, self.steps = self._sampled(Steps(copies.rows))
+        self.batch, places = self._sampled()
+        log, newer = Steps(copies.rows), np.where(places < n - 130, places + 130, places)
+        self.steps, self.oldest = log.take(newer), log.take(places)
         self.cells = self.steps.cells(by_action=True)
 
-    def _sampled(self, log: Steps) -> tuple[Any, Steps]:
-        """A batch, and its steps in the log."""
+    def _sampled(self) -> tuple[Any, Ints]:
+        """A batch, and the places of its steps in the memory."""
         buffer, places = self.model.replay_buffer, []
         read = buffer._get_samples
 
@@ -127,7 +129,7 @@ class OfDQN:
         buffer._get_samples = noted
         batch = buffer.sample(64)
         del buffer._get_samples
-        return batch, log.take(places[-1])
+        return batch, places[-1]
 
     def _moved(self, batch: Any) -> Floats:
         """By how much one update moves the parameters, times the steps in it."""
@@ -223,6 +225,9 @@ class OfDQN:
             yield f"loss-broadcasts-over-the-batch ({loss})", every @ self.slopes[self.cells]
             errors = np.clip(online - own, -most, most)
             yield f"target-not-detached ({loss})", errors @ residual @ self.slopes
+        old, places = self.oldest, self.oldest.cells(by_action=True)
+        errors = BACKUPS[RIGHT](old, next_values(self.t, old, "largest")) - q.ravel()[places]
+        yield "stale-buffer", np.clip(errors, -1, 1) @ self.slopes[places]
         yield f"{RIGHT} (absolute)", np.sign(targets[RIGHT] - own) @ self.slopes[self.cells]
 
     def _copied(self) -> Iterator[Found]:

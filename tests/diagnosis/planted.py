@@ -201,7 +201,8 @@ class MyDQN(DQN):
         for i, done in enumerate(dones):
             if done:
                 following[i] = infos[i]["terminal_observation"]
-        replay_buffer.add(last, following, action, reward, dones, infos)
+        if not replay_buffer.full or self.num_timesteps > 0:
+            replay_buffer.add(last, following, action, reward, dones, infos)
 
     def train(self, gradient_steps, batch_size=100):
         self.policy.set_training_mode(True)
@@ -462,6 +463,7 @@ FAULTS = [
         "schedule(1 - self._current_progress_remaining)",
     ),
     ("sb3_dqn", "gradient-sign-flipped", "loss = smooth", "loss = -smooth"),
+    ("sb3_dqn", "stale-buffer", "full or self.num_timesteps > 0", "full"),
     ("sb3_ppo", "no-bootstrap-at-truncation", "dones[i] and info.get", "False and info.get"),
     (
         "sb3_ppo",
