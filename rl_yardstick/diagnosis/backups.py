@@ -211,7 +211,12 @@ def candidates(d: Steps, rule: str, own: Floats, first: Floats) -> Iterator[Cand
         yield solve(f"step-before-{name}-never-learnt", BACKUPS[RIGHT], part, rule, kept)
     yield solve("learns-from-steps-after-the-end", BACKUPS[RIGHT], _with_resets(d), rule, own)
     yield _not_detached(d, rule, own)
+    yield solve("loss-broadcasts-over-the-batch", _mean_of_all, d, rule, own)
     yield from (_of_actions(d, rule, own, first) if own.shape[1] > 1 else _of_states(d, own))
+
+
+def _mean_of_all(d: Steps, v: Values) -> Floats:
+    return np.full(len(d.state), np.average(BACKUPS[RIGHT](d, v), weights=d.weight))
 
 
 def _of_actions(d: Steps, rule: str, own: Floats, first: Floats) -> Iterator[Candidate]:
@@ -225,8 +230,6 @@ def _of_actions(d: Steps, rule: str, own: Floats, first: Floats) -> Iterator[Can
         yield solve("action-of-another-step", right, other, rule, own)
     still = next_values(first, d, rule)
     yield solve("target-never-copied", lambda d, v: right(d, still), d, rule, own)
-    everywhere = lambda d, v: np.full(len(d.state), np.average(right(d, v), weights=d.weight))  # noqa: E731
-    yield solve("loss-broadcasts-over-the-batch", everywhere, d, rule, own)
 
 
 def _of_states(d: Steps, own: Floats) -> Iterator[Candidate]:
@@ -279,20 +282,22 @@ class Measured(NamedTuple):
     where_cut: float  # of the value of what a truncated episode shows last
     misfit: float = 0.0  # root mean square, in tolerances
 
+    def off(self) -> list[bool]:
+        """Which coefficients are not right."""
+        right = (1.0, 0.0, GAMMA, 0.0, GAMMA)
+        return [abs(found - wanted) > 0.08 for found, wanted in zip(self, right, strict=False)]
+
     def words(self) -> str:
         """The target in a line, and what would be right where it is not."""
-        right = Measured(1.0, 0.0, GAMMA, 0.0, GAMMA)
-        terms = ("reward", "", "next value", "value at the end", "value where cut off")
-        parts, other = [], []
-        for term, found, wanted in zip(terms, self, right, strict=False):
-            is_off = abs(found - wanted) > 0.08
-            if is_off or term in ("reward", "next value", "value where cut off"):
-                parts.append(f"{found + 0.0005:.2f} {term}".strip())
-            if is_off:
-                other.append(f"{wanted:.2f} {term}".strip())
-        told = " + ".join(parts).replace("+ -", "- ")
+        right = ["1.00 reward", "0.00", "0.80 next value", "0.00 value at the end"]
+        right.append("0.80 value where cut off")
+        told = [f"{found + 0.0005:.2f}{text[4:]}" for found, text in zip(self, right, strict=False)]
+        off = self.off()
+        shown = [text for i, text in enumerate(told) if off[i] or i in (0, 2, 4)]
+        other = ", ".join(text for i, text in enumerate(right) if off[i])
         about = "about " if self.misfit > 1 else ""
-        return f"target = {about}{told}" + (f"; right would be {', '.join(other)}" if other else "")
+        line = f"target = {about}{' + '.join(shown)}".replace("+ -", "- ")
+        return f"{line}; right would be {other}" if other else line
 
 
 def parts_of(d: Steps, ahead: Floats) -> list[Floats]:

@@ -6,7 +6,7 @@ log-probabilities, each times an error. The world's own log gives the errors of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -288,9 +288,7 @@ class OfActor:
         del self.model.train
         self.steps = d = Steps(copies.rows[:n])
         d.next_state[-1] = d.shown[-1]
-        names = ("log_probs", "advantages", "returns")
-        kept = (getattr(self.model.rollout_buffer, name)[:, 0] for name in names)
-        self.logs, self.advantages, self.returns = (each.astype(float) for each in kept)
+        self.advantages = self.model.rollout_buffer.advantages[:, 0].astype(float)
         with th.no_grad():
             told = self.policy.predict_values(th.eye(N_STATES))[:, 0]
         self.v: Floats = np.asarray(told.double().numpy())
@@ -303,45 +301,22 @@ class OfActor:
 
     def faults(self) -> Iterator[Found]:
         """Yield the faults, the first of which explains the others."""
-        d, own, table = self.steps, self.v[self.steps.state], self._advantages()
-        right, whole = table[RIGHT], table["lambda-missing"]
-        seen = th.eye(N_STATES)[d.state]
-        with th.no_grad():
-            chosen, other = (
-                self.policy.evaluate_actions(seen, th.as_tensor(actions))[1].double().numpy()
-                for actions in (d.action, 1 - d.action)
-            )
-        found = self.advantages + own
-        checks: Mapping[str, tuple[Floats, Mapping[str, Floats]]] = {
-            "log-probabilities": (
-                self.logs,
-                {RIGHT: chosen, "log-prob-of-the-wrong-action": other}
-                | {"probabilities-not-their-logarithms": np.exp(chosen)},
-            ),
-            "advantages": (self.advantages, table),
-            "returns": (
-                self.returns,
-                {RIGHT: found, f"{RIGHT} (of all steps)": whole + own}
-                | {
-                    "value-target-is-the-advantage": right,
-                    "returns-subtract-the-value": right - own,
-                }
-                | {"returns-normalised": (found - found.mean()) / (found.std() + 1e-8)},
-            ),
-        }
-        for what, (kept, formulas) in checks.items():
-            is_near = {name: np.allclose(kept, each, atol=1e-4) for name, each in formulas.items()}
-            names = [fault_of(name) for name, near in is_near.items() if near]
-            if RIGHT not in names:
-                off = int((~np.isclose(kept, formulas[RIGHT], atol=1e-4)).sum())
-                told = f"stored {what} differ in {off} of {self.n} steps"
-                yield " or ".join(dict.fromkeys(names)), told
+        table = self._advantages()
+        names = [fault_of(name) for name, each in table.items() if self._is_near(each)]
+        if RIGHT not in names:
+            off = int((~np.isclose(self.advantages, table[RIGHT], atol=1e-4)).sum())
+            told = f"stored advantages differ in {off} of {self.n} steps"
+            yield " or ".join(dict.fromkeys(names)), told
+        self.of_all_steps = table["lambda-missing"]
         yield from self._updated()
         if self.is_ppo:
             yield from self._minibatches()
         with th.no_grad():
             best = self.policy.get_distribution(th.eye(N_STATES)).mode().numpy()
         yield from in_evaluation(self.model, best)
+
+    def _is_near(self, advantages: Floats) -> bool:
+        return np.allclose(self.advantages, advantages, atol=1e-4)
 
     def _advantages(self) -> dict[str, Floats]:
         """The advantages of a rollout, by each formula of targets and of traces."""
@@ -403,12 +378,16 @@ class OfActor:
         moved = (parameters_of(policy) - before) / PROGRESS
         if (size := np.linalg.norm(moved)) < 1e-9:
             yield DOES_NOT_LEARN
-        errors, scaled = self.returns - self.v[d.state], (a - a.mean()) / (a.std(ddof=1) + 1e-8)
+        own, scaled = self.v[d.state], (a - a.mean()) / (a.std(ddof=1) + 1e-8)
+        returns = a + own
         critics = {
-            RIGHT: errors,
-            f"{RIGHT} (huber)": np.clip(errors, -1, 1),
-            "loss-broadcasts-over-the-batch": np.mean(self.returns) - self.v[d.state],
-            "value-target-is-the-advantage": a - self.v[d.state],
+            RIGHT: a,
+            f"{RIGHT} (of all steps)": self.of_all_steps,
+            f"{RIGHT} (huber)": np.clip(a, -1, 1),
+            "loss-broadcasts-over-the-batch": returns.mean() - own,
+            "value-target-is-the-advantage": a - own,
+            "returns-subtract-the-value": a - 2 * own,
+            "returns-normalised": (returns - returns.mean()) / (returns.std() + 1e-8) - own,
         }
         forms = {RIGHT: scaled if self.is_ppo else a}
         forms["advantage-normalisation"] = a if self.is_ppo else scaled
@@ -419,9 +398,7 @@ class OfActor:
                     matrix = np.array([weights @ gains, of_entropy, error @ of_values]).T
                     sizes, *_ = np.linalg.lstsq(matrix, moved, rcond=None)
                     if np.linalg.norm(matrix @ sizes - moved) < 2e-3 * size:
-                        names = [
-                            each for each in map(fault_of, (name, form, critic)) if each != RIGHT
-                        ]
+                        names = [each for each in (name, form, fault_of(critic)) if each != RIGHT]
                         found.append((len(names), " and ".join(names), sizes))
         if not found:
             yield "", OTHERWISE
@@ -431,7 +408,7 @@ class OfActor:
 
     def _sized(self, name: str, sizes: Floats) -> Iterator[Found]:
         """The fault of an update whose parts have these step sizes; 1 would be right."""
-        policy, entropy, value = (float(each) for each in sizes)
+        policy, entropy, value = sizes
         told = f"steps of policy, entropy, values: {policy:.2f}, {entropy:.2f}, {value:.2f} times"
         spread = self.advantages.std(ddof=1)
         checks = {
