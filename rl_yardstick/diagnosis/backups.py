@@ -226,8 +226,8 @@ def _of_actions(d: Steps, rule: str, own: Floats, first: Floats) -> Iterator[Can
         if not (is_same or (wrong == "mean" and rule != "largest" and d.exploration[-1] > 0.8)):
             yield solve(name_of_rule(wrong, rule), right, d, wrong, own)
     other = copy.copy(d)
-    for other.action in (d.action_before, d.next_action):
-        yield solve("action-of-another-step", right, other, rule, own)
+    for tag, other.action in (("before", d.action_before), ("after", d.next_action)):
+        yield solve(f"action-of-another-step ({tag})", right, other, rule, own)
     still = next_values(first, d, rule)
     yield solve("target-never-copied", lambda d, v: right(d, still), d, rule, own)
 
