@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -125,6 +125,8 @@ def nearest(trainings: Sequence[_Training], rule: str) -> list[Near]:
     ranking = []
     for name, (difference, tolerance, uses) in sums.items():
         is_used = uses > 0
+        if not is_used.any():
+            raise UserError(f"no state was visited {VISITS} times: it trained for too few steps")
         z = np.abs(difference[is_used] / tolerance[is_used])
         ranking.append(Near(float(np.sqrt(np.mean(z**2))), float(z.max()), name))
     return sorted(ranking)
@@ -165,7 +167,7 @@ class _ByValues:
             trained, begun = (self.subject.train(steps, seed) for steps in (n, 3))
             assert trained.values is not None
             assert begun.values is not None
-            steps = Steps(trained.rows, late=0.35)
+            steps = reduce(Steps.joined, [Steps(log, late=0.35) for log in trained.logs])
             found.append(_Training(trained.values, begun.values, steps, trained.act))
         return found
 
@@ -250,9 +252,11 @@ def _credit(subject: Subject) -> tuple[str, str] | None:
 
     if changed(25, 10**9).max() > 0:
         return "not-reproducible", "two trainings with the same seed differ"
+    if len(subject.train(9, 1).logs) != 1:  # of copies it is not known which one is first
+        return None
     for first, end in ((1, 5), (5, 7), (7, 9)):  # first steps of episodes, and steps till the next
         change = changed(end, first)
-        earlier = {row[0] for row in subject.train(end, 1).rows[:first]}
+        earlier = {row[0] for row in subject.train(end, 1).logs[0][:first]}
         if leak := sorted(earlier & set(np.flatnonzero(change > 1e-9).tolist())):
             text = f"the reward of step {first + 1}, the first of an episode, changes state "
             text += f"{leak[-1]} of an earlier one by {change[leak[-1]]:.3f}"

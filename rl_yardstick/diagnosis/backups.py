@@ -245,12 +245,10 @@ def _of_states(d: Steps, own: Floats) -> Iterator[Candidate]:
 
 def _with_resets(d: Steps) -> Steps:
     """The log with a step of reward 0 from each end to the next episode's start."""
-    more, joined = d.take(np.flatnonzero(d.over)), copy.copy(d)
+    more = d.take(np.flatnonzero(d.over))
     more.state, more.shown = more.shown, more.next_state
     more.reward = more.terminated = more.truncated = more.over = 0 * more.over
-    for name, each in vars(d).items():
-        setattr(joined, name, np.concatenate([each, getattr(more, name)]))
-    return joined
+    return d.joined(more)
 
 
 def _not_detached(d: Steps, rule: str, own: Floats) -> Candidate:

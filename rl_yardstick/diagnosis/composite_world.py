@@ -155,6 +155,13 @@ class Steps:
             setattr(part, name, each[places])
         return part
 
+    def joined(self, other: Steps) -> Steps:
+        """These steps, and others."""
+        both = copy(self)
+        for name, each in vars(self).items():
+            setattr(both, name, np.concatenate([each, getattr(other, name)]))
+        return both
+
     def cells(self, by_action: bool) -> Ints:
         """The number of each step's cell: of the state, or of the state and action."""
         return self.state * N_ACTIONS + self.action if by_action else self.state
@@ -188,7 +195,7 @@ class Copies:
         first = (len(self.logs) - 1) * 4 % len(STORIES)
         return CompositeWorld(self.logs[-1], self.is_discrete, first, self.bump)
 
-    @property
-    def rows(self) -> list[Row]:
-        """The longest log: that of a copy for training, not of one for evaluations."""
-        return max(self.logs, key=len, default=[])
+    def of_training(self) -> list[list[Row]]:
+        """The logs of copies for training, which are longer than those for evaluations."""
+        most = max(map(len, self.logs), default=0)
+        return [log for log in self.logs if 2 * len(log) > most]

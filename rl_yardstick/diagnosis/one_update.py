@@ -113,7 +113,7 @@ class OfDQN:
         self.q = values.detach().double().numpy()
         self.t = self.model.q_net_target(eye).detach().double().numpy()
         self.batch, places = self._sampled()
-        log, newer = Steps(copies.rows), np.where(places < n - 130, places + 130, places)
+        log, newer = Steps(copies.logs[0]), np.where(places < n - 130, places + 130, places)
         self.steps, self.oldest = log.take(newer), log.take(places)
         self.cells = self.steps.cells(by_action=True)
 
@@ -286,7 +286,7 @@ class OfActor:
         self.model.train = lambda: None
         self.model.learn(n)
         del self.model.train
-        self.steps = d = Steps(copies.rows[:n])
+        self.steps = d = Steps(copies.logs[0][:n])
         d.next_state[-1] = d.shown[-1]
         self.advantages = self.model.rollout_buffer.advantages[:, 0].astype(float)
         with th.no_grad():

@@ -56,7 +56,7 @@ class Trained(NamedTuple):
 
     values: Floats | None  #: of actions (S, 2) or of states (S, 1); None if they cannot be read
     act: Callable[[int], int]  #: the action in a state when evaluated
-    rows: list[Row]  #: the log
+    logs: list[list[Row]]  #: of each copy of the world
     model: Any
 
 
@@ -94,7 +94,7 @@ class Subject(ABC):
             action = model.predict(np.asarray(shown[state]), deterministic=True)[0]
             return int(np.asarray(action).reshape(-1)[0])
 
-        return Trained(values_of(model, shown), act, copies.rows, model)
+        return Trained(values_of(model, shown), act, copies.of_training(), model)
 
     def named(self, *names: str) -> str | None:
         """The first of these settings that the learner has."""
