@@ -196,14 +196,15 @@ class _ByValues:
                 return verdict("wrong", other_fault[0], notes=(other_fault[1],))
             unseen = UNSEEN_OF_ACTORS if rule == "states" else UNSEEN
             return verdict("right", unseen="" if self.is_table else unseen)
-        is_tight = near[0].rms <= (0.4 if self.is_table else 0.5) and near[0].worst <= 3
+        tight, farther = (0.4, 1.2) if self.is_table else (0.7, 1.5)
+        is_tight = near[0].rms <= tight and near[0].worst <= 4
         fault = fault_of(near[0].name)
         other = next(each for each in near if fault_of(each.name) != fault)
         told = [f"{fault_of(each.name)} at {each.rms:.2f}" for each in (near[0], other)]
         note = f"nearest in tolerances: {told[0]}, {told[1]}; right at {right.rms:.2f}"
         if fault == RIGHT and not any(backup.off()):  # it is too noisy, or learns too slowly
             return verdict("unreadable", notes=(note,))
-        is_named = is_tight and other.rms > 1.2 * near[0].rms and fault != RIGHT
+        is_named = is_tight and other.rms > farther * near[0].rms and fault != RIGHT
         return verdict("wrong", fault if is_named else "", notes=(note,))
 
     def _other_fault(self, trainings: Sequence[_Training]) -> tuple[str, str] | None:
