@@ -44,7 +44,7 @@ from rl_yardstick.commands import train as train_command
 from rl_yardstick.commands import tune as tune_command
 from rl_yardstick.commands.cli import import_typed
 from rl_yardstick.commands.terminal import TextConsole
-from rl_yardstick.diagnosis import audit as probes
+from rl_yardstick.diagnosis import audit as audits
 from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.diagnosis.explanation import explanation
 from rl_yardstick.envs import known_models
@@ -224,12 +224,13 @@ def explain(model: Any, env: Any = None, **env_kwargs: Any) -> Told:
 def audit(algo: str | type, **settings: Any) -> Told:
     """Test an implementation for known bugs, as ``audit``.
 
-    Returns ``verdict``, ``fault``, ``faults`` and ``probes`` by name.
+    Returns by name: ``verdict``, ``fault``, ``target`` (the measured backup in words), ``measured``
+    (its coefficients), ``notes`` and ``not_seen``.
     """
     args = _flags(audit_command, [], algo, settings)
     subject = audit_command.subject_of(args)
-    verdict = probes.Verdict(subject.name, (*probes.audit(subject, range(args.seeds)),))
-    return Told(verdict.as_json(), [subject.name, *audit_command.verdict_lines(verdict)])
+    verdict = audits.audit(subject, args.seeds or 0)
+    return Told(verdict.as_json(), [subject.name, *verdict.lines()])
 
 
 def optimum(env: Any, **env_kwargs: Any) -> Told:

@@ -1,39 +1,29 @@
-"""Runs the probes on an algorithm, over seeds, and comes to a verdict."""
+"""Which backup a program makes: its values after training, or one update, against all formulas."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+from typing import Any, Literal, NamedTuple
 
-from rl_yardstick.diagnosis import agent_probes, target_probes
-from rl_yardstick.diagnosis.faults import FAULTS, Finding
-from rl_yardstick.diagnosis.subjects import Lab, NotSettled, Subject
+import numpy as np
+
+from rl_yardstick.diagnosis.backups import (
+    RIGHT,
+    Measured,
+    candidates,
+    fault_of,
+    is_table,
+    measured,
+)
+from rl_yardstick.diagnosis.composite_world import BETTER, END, GAMMA, N_STATES, Steps
+from rl_yardstick.diagnosis.subjects import KINDS, Subject
+from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError, one_line
 
-Probe = Callable[[Lab], Finding | None]
-PROBES: Mapping[Probe, str] = {
-    target_probes.probe_ends: "the end of an episode",
-    target_probes.probe_discount: "the discount",
-    target_probes.probe_cuts: "an episode that is cut off",
-    target_probes.probe_next_action: "the next action",
-    target_probes.probe_ratio: "the importance ratio",
-    target_probes.probe_target_network: "the target network",
-    target_probes.probe_age: "the age of training data",
-    target_probes.probe_n_steps: "targets of several steps",
-    target_probes.probe_advantages: "advantages of rollouts",
-    target_probes.probe_traces: "traces",
-    agent_probes.probe_choice: "what it does when evaluated",
-    agent_probes.probe_entropy: "the entropy term",
-    agent_probes.probe_schedules: "the schedule of the learning rate",
-    agent_probes.probe_exploration: "the schedule of exploration",
-    agent_probes.probe_seeds: "seeds",
-    agent_probes.probe_files: "saving and loading",
-}
-# A fault of one-step targets explains these faults of targets of several steps.
-_OF_ONE_STEP = frozenset(list(FAULTS)[: list(FAULTS).index("importance-ratio")])
-_OF_SEVERAL = frozenset({"n-step-return", "traces"})
+State = Literal["right", "wrong", "unreadable"]
 
 
 @dataclass(frozen=True)
@@ -41,83 +31,240 @@ class Verdict:
     """The result of an audit."""
 
     subject: str
-    findings: tuple[Finding, ...]
-
-    @property
-    def faults(self) -> list[Finding]:
-        """The faults, the one that explains most first, without those that follow from another."""
-        found = [finding for finding in self.findings if finding.state == "fault"]
-        if _OF_ONE_STEP & {finding.fault for finding in found}:
-            found = [finding for finding in found if finding.fault not in _OF_SEVERAL]
-        return sorted(found, key=lambda finding: list(FAULTS).index(finding.fault))
-
-    @property
-    def is_right(self) -> bool:
-        """Whether the targets were checked and no fault was found."""
-        states = {f.probe: f.state for f in self.findings}
-        deciding = (target_probes.probe_ends, target_probes.probe_discount)
-        return not self.faults and all(states.get(PROBES[probe]) == "ok" for probe in deciding)
+    state: State
+    fault: str = ""  #: its name; empty if none is near enough, or if it is right
+    target: str = ""  #: the backup that was measured, in words
+    notes: tuple[str, ...] = ()  #: what the verdict rests on
+    unseen: str = ""  #: what the audit cannot see of such a program
+    measured: Measured | None = None  #: None if it cannot be read
 
     @property
     def exit_code(self) -> int:
-        """0 if right, 1 for a fault, 2 if nothing can be said."""
-        return 1 if self.faults else 0 if self.is_right else 2
+        """0 if right, 1 for a fault, 2 if it cannot be read."""
+        return ("right", "wrong", "unreadable").index(self.state)
+
+    def lines(self) -> list[str]:
+        """The verdict in a few lines: first the backup, as measured."""
+        first = [self.target] if self.target else []
+        if self.state == "right":
+            rest = f"targets and choices right; not seen: {self.unseen}" if self.unseen else "right"
+            return [*first, rest, *self.notes]
+        name = f"fault: {self.fault}" if self.fault else "wrong: no known fault is near"
+        return [*first, name if self.state == "wrong" else "cannot be read", *self.notes]
 
     def as_json(self) -> dict[str, Any]:
-        """The verdict as JSON: the findings, and the sentence and source of each fault."""
-        words = ("right", "fault", "nothing can be said")
-        faults = [
-            {"fault": finding.fault, **FAULTS[finding.fault]._asdict()}
-            | {"measured": finding.text, "right": finding.right}
-            for finding in self.faults
-        ]
-        return {
-            "algorithm": self.subject,
-            "verdict": words[self.exit_code],
-            "fault": faults[0]["fault"] if faults else None,
-            "faults": faults,
-            "probes": [asdict(finding) for finding in self.findings],
+        """The verdict as JSON."""
+        words = {"right": "right", "wrong": "fault", "unreadable": "nothing can be said"}
+        told: dict[str, Any] = {
+            "measured": self.measured and self.measured._asdict(),
+            "notes": [*self.notes],
         }
+        told |= {"fault": self.fault or None, "target": self.target, "not_seen": self.unseen}
+        return {"algorithm": self.subject, "verdict": words[self.state], **told}
 
 
-def audit(
-    subject: Subject, seeds: Sequence[int], probes: Collection[Probe] | None = None
-) -> Iterator[Finding]:
-    """Yield the findings of each probe.
+def audit(subject: Subject, seeds: int = 0) -> Verdict:
+    """Audit an algorithm.
 
-    A probe that finds nothing wrong with the first seed is done. Otherwise it is repeated with the
-    other seeds, and the majority counts.
+    A subclass of the library's DQN, PPO or A2C is asked for one update, which is compared exactly.
+    All else is trained in the composite world, with each of ``seeds`` seeds (default: 3 for a
+    table, 2 for a network), and its values are compared with those to which each formula leads.
     """
-    labs = [Lab(subject, seed) for seed in seeds]
-    reads_values = {*list(PROBES)[:10], agent_probes.probe_schedules}
-    if not subject.has_values:
-        text = "it has no values, so its targets cannot be checked"
-        yield Finding("skipped", text, probe="its values")
-    for probe in PROBES if probes is None else probes:
-        if probe in reads_values and not subject.has_values:
-            continue
-        found: list[Finding | None] = []
-        for lab in labs:
-            try:
-                found.append(probe(lab))
-            except NotSettled as error:
-                found.append(Finding("unsaid", str(error)))
-            except UserError:
-                raise
-            except Exception as error:  # noqa: BLE001 (user code may raise anything)
-                text = f"it cannot train here: {type(error).__name__}: {one_line(error)}"
-                found.append(Finding("unsaid", text))
-            if found[0] is None or found[0].state in ("ok", "skipped"):
-                break
-        if (agreed := _most_agreed(found)) is not None:
-            yield replace(agreed, probe=PROBES.get(probe, probe.__name__))
+    from rl_yardstick.diagnosis.one_update import audit_update
+
+    try:
+        with warnings.catch_warnings():  # of the program that is audited
+            warnings.simplefilter("ignore")
+            if (found := audit_update(subject)) is None:
+                return _ByValues(subject, seeds).verdict()
+        told, (fault, note) = found[0], found[1] or ("", "")
+        state: State = "wrong" if note else "right"
+        return Verdict(subject.name, state, fault, told.words(), (note,) * bool(note), "", told)
+    except UserError:
+        raise
+    except Exception as error:  # noqa: BLE001 (user code may raise anything)
+        why = f"it cannot train here: {type(error).__name__}: {one_line(error)}"
+        return Verdict(subject.name, "unreadable", notes=(why,))
 
 
-def _most_agreed(found: list[Finding | None]) -> Finding | None:
-    """The finding of the majority of seeds, as the first of these seeds gave it."""
-    signs = [(None, "") if each is None else (each.state, each.fault) for each in found]
-    (sign, n), *_ = Counter(signs).most_common()
-    if 2 * n > len(signs):
-        return found[signs.index(sign)]
-    told = sorted({fault or str(state) for state, fault in signs})
-    return Finding("unsaid", f"seeds disagree: {', '.join(told)}")
+# --- by values after training ---------------------------------------------------------------------
+
+VISITS = 40  # of a cell whose value counts
+LENGTHS = (1, 2, 4)  # of trainings, until values have settled
+
+
+class Near(NamedTuple):
+    """How far a formula's values are from those learnt, in tolerances."""
+
+    rms: float
+    worst: float
+    name: str
+
+
+class _Training(NamedTuple):
+    """The values that one seed learnt, and the log."""
+
+    values: Floats
+    first: Floats
+    steps: Steps
+    act: Callable[[int], int]
+
+
+def nearest(trainings: Sequence[_Training], rule: str) -> list[Near]:
+    """All formulas, the nearest first: differences are averaged over seeds before they count."""
+    sums: dict[str, list[Floats]] = {}
+    for one in trainings:
+        counts = one.steps.counts(one.values.shape[1] > 1)
+        for found in candidates(one.steps, rule, one.values, one.first):
+            uses = (counts >= VISITS).astype(float)
+            uses[END] = 0.0
+            tolerance = 0.08 + 0.05 * np.abs(found.values) + 0.35 * found.spread
+            parts = [uses * (one.values - found.values), uses * tolerance, uses]
+            before = sums.setdefault(found.name, [0.0 * uses] * 3)
+            sums[found.name] = [a + b for a, b in zip(before, parts, strict=True)]
+    ranking = []
+    for name, (difference, tolerance, uses) in sums.items():
+        is_used = uses > 0
+        if not is_used.any():
+            raise UserError(f"no state was visited {VISITS} times: it trained for too few steps")
+        z = np.abs(difference[is_used] / tolerance[is_used])
+        ranking.append(Near(float(np.sqrt(np.mean(z**2))), float(z.max()), name))
+    return sorted(ranking)
+
+
+@dataclass
+class _ByValues:
+    """The audit of a program that is trained in the composite world."""
+
+    subject: Subject
+    n_seeds: int = 0
+
+    def verdict(self) -> Verdict:
+        """Train longer until the values have settled, and compare them."""
+        start = self.subject.train(1, 1).values
+        if start is None:
+            return Verdict(self.subject.name, "unreadable", notes=(NO_VALUES,))
+        self.is_table = is_table(start)
+        length, before, last = 6800 if self.is_table else 8500, np.inf, np.inf
+        for times in LENGTHS:
+            trainings = self._trainings(times * length)
+            if not np.isfinite([one.values for one in trainings]).all():
+                return Verdict(self.subject.name, "wrong", notes=("its values are not finite",))
+            rule, near = self._by_rules(trainings)
+            right = next(each for each in near if each.name == RIGHT)
+            found = self._judged(trainings, rule, near, right)
+            if found.state == "right" or found.fault or right.rms > 0.9 * before:
+                return found
+            before, last = right.rms, before
+        if before < 0.7 * last:
+            note = f"its values still change after {LENGTHS[-1] * length:,} steps: it learns slowly"
+            return replace(found, state="unreadable", notes=(note,))
+        return found
+
+    def _trainings(self, n: int) -> list[_Training]:
+        found = []
+        for seed in range(1, 1 + (self.n_seeds or (3 if self.is_table else 2))):
+            trained, begun = (self.subject.train(steps, seed) for steps in (n, 3))
+            assert trained.values is not None
+            assert begun.values is not None
+            steps = reduce(Steps.joined, [Steps(log, late=0.35) for log in trained.logs])
+            found.append(_Training(trained.values, begun.values, steps, trained.act))
+        return found
+
+    def _by_rules(self, trainings: Sequence[_Training]) -> tuple[str, list[Near]]:
+        """The rule of the next value, the nearest right one if the kind is not known."""
+        rule = KINDS.get(self.subject.kind or "", "")
+        rules = [rule] if rule not in ("", "states") else ["largest", "next", "expected"]
+        if trainings[0].values.shape[1] == 1:
+            rules = ["states"]
+        ranked = {rule: nearest(trainings, rule) for rule in rules}
+
+        def distance(rule: str) -> float:
+            return next(near.rms for near in ranked[rule] if near.name == RIGHT)
+
+        best = min(ranked, key=distance)
+        return best, ranked[best]
+
+    def _judged(
+        self, trainings: Sequence[_Training], rule: str, near: list[Near], right: Near
+    ) -> Verdict:
+        one = trainings[-1]
+        backup = measured(one.values, one.steps, rule)
+        verdict = partial(Verdict, self.subject.name, target=backup.words(), measured=backup)
+        if right.rms <= 0.5 and right.worst <= 3 and right.rms <= near[0].rms + 0.1:
+            if other_fault := self._other_fault(trainings):
+                return verdict("wrong", other_fault[0], notes=(other_fault[1],))
+            unseen = UNSEEN_OF_ACTORS if rule == "states" else UNSEEN
+            return verdict("right", unseen="" if self.is_table else unseen)
+        tight, farther = (0.4, 1.2) if self.is_table else (0.7, 1.5)
+        is_tight = near[0].rms <= tight and near[0].worst <= 4
+        fault = fault_of(near[0].name)
+        other = next(each for each in near if fault_of(each.name) != fault)
+        told = [f"{fault_of(each.name)} at {each.rms:.2f}" for each in (near[0], other)]
+        note = f"nearest in tolerances: {told[0]}, {told[1]}; right at {right.rms:.2f}"
+        if fault == RIGHT and not any(backup.off()):  # it is too noisy, or learns too slowly
+            return verdict("unreadable", notes=(note,))
+        is_named = is_tight and other.rms > farther * near[0].rms and fault != RIGHT
+        return verdict("wrong", fault if is_named else "", notes=(note,))
+
+    def _other_fault(self, trainings: Sequence[_Training]) -> tuple[str, str] | None:
+        """A fault that leaves the values right, and the sentence that shows it."""
+        checks: list[Callable[[], tuple[str, str] | None]] = [partial(_choices, trainings)]
+        if self.is_table:
+            checks.append(partial(_credit, self.subject))
+        return next(filter(None, (check() for check in checks)), None)
+
+
+UNSEEN = "minibatches, the loss's form, schedules"
+UNSEEN_OF_ACTORS = "the trace, normalisation, clipping, minibatches"
+NO_VALUES = "add the method values(obs): a list with a number for each action, or the state's value"
+
+
+def _choices(trainings: Sequence[_Training]) -> tuple[str, str] | None:
+    """What it does where one action pays more: an actor late in training, others when asked."""
+    if trainings[0].values.shape[1] == 1:
+        steps = [one.steps for one in trainings]
+        late = [(d.weight > 0) & np.isin(d.state, [*BETTER]) for d in steps]
+        better = np.array([BETTER.get(state, -1) for state in range(N_STATES)])
+        hits = [d.action[use] == better[d.state[use]] for d, use in zip(steps, late, strict=True)]
+        share = float(np.mean(np.concatenate(hits)))
+        text = f"late in training it does the action that pays more in {share:.0%}"
+        return None if share > 0.6 else ("advantage-sign" if share < 0.35 else "", text)
+    asked = [
+        np.mean([one.act(state) == BETTER[state] for _ in range(100)])
+        for one in trainings
+        for state in (13, 14)
+    ]
+    low, high = min(asked), max(asked)
+    text = f"it does the action that pays in {low:.0%} to {high:.0%} of 100 times, when evaluated"
+    fault = "acts-by-the-worst-value" if high < 0.03 else "explores-in-evaluation"
+    return None if low > 0.97 else (fault, text)
+
+
+def _credit(subject: Subject) -> tuple[str, str] | None:
+    """What the reward of one step changes: nothing of an earlier episode, nothing by chance."""
+    name = subject.named("trace_decay", "lam", "lambda_", "lmbda")
+    decay = {} if name is None else {name: 0.5}
+
+    def changed(n: int, step: int, seed: int = 1) -> Floats:
+        values = [subject.train(n, seed, bump, **decay).values for bump in (step, -1)]
+        found: Floats = np.abs(np.subtract(*map(np.asarray, values))).max(axis=1)
+        return found
+
+    if changed(25, 10**9).max() > 0:
+        return "not-reproducible", "two trainings with the same seed differ"
+    if len(subject.train(9, 1).logs) != 1:  # of copies it is not known which one is first
+        return None
+    for first, end in ((1, 5), (5, 7), (7, 9)):  # first steps of episodes, and steps till the next
+        change = changed(end, first)
+        earlier = {row[0] for row in subject.train(end, 1).logs[0][:first]}
+        if leak := sorted(earlier & set(np.flatnonzero(change > 1e-9).tolist())):
+            text = f"the reward of step {first + 1}, the first of an episode, changes state "
+            text += f"{leak[-1]} of an earlier one by {change[leak[-1]]:.3f}"
+            return "traces-not-reset", text
+    back = [changed(5, 4, seed) for seed in range(1, 7)]
+    shares = [change[3] / change[4] for change in back if change[4]]
+    if decay and shares and abs(max(shares) - 0.5 * GAMMA) > 0.01:
+        text = f"credit fades to {max(shares):.2f} with a step back at lambda 0.5"
+        return "trace-decay", f"{text}; right would be {0.5 * GAMMA:g}"
+    return None

@@ -11,7 +11,6 @@ import pytest
 import yaml
 
 from rl_yardstick.commands import COMMANDS
-from rl_yardstick.diagnosis.audit import PROBES, audit
 from tests.pipeline.short_runs import trained
 
 ROOT = Path(__file__).parents[2]
@@ -93,7 +92,6 @@ def test_mistakes_are_one_line(line, said, type_command, tmp_path, request):
 
 def test_no_line_in_a_pipe_is_too_wide(type_command, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr(audit, "__defaults__", ([*PROBES][3:10],))  # the fault is among them
     monkeypatch.setattr("rl_yardstick.envs.checking.N_STEPS", 600)  # of 60,000, most of its time
     for words in [*(f"{command} --help" for command in COMMANDS), *TABLE["right"]]:
         code, out, err = type_command("yardstick", *words.split())

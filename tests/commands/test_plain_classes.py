@@ -13,8 +13,6 @@ import pytest
 
 from rl_yardstick import agents
 from rl_yardstick.agents.own_classes import parameters_of
-from rl_yardstick.diagnosis import agent_probes, target_probes
-from rl_yardstick.diagnosis.audit import audit
 from rl_yardstick.experiments.pool import process_pool
 from rl_yardstick.pipeline.callbacks import StateCallback
 from rl_yardstick.pipeline.components import import_modules
@@ -249,13 +247,11 @@ def test_commands_take_it(type_in_own_folder, own_folder, in_this_process):
     assert "mine.Table                 undecided" in out
 
 
-def test_audit_takes_it(type_in_own_folder, monkeypatch):
-    probes = (agent_probes.probe_choice, target_probes.probe_ends, target_probes.probe_discount)
-    monkeypatch.setattr(audit, "__defaults__", (probes,))
-    words = ("--algo", "mine:Table", "--kind", "q_learning", "--observations", "discrete")
+def test_audit_takes_it(type_in_own_folder):
+    words = ("--algo", "mine:Table", "--kind", "q_learning", "--seeds", "1")
     code, out, err = type_in_own_folder("yardstick", "audit", *words)
     assert (code, err) == (0, ""), out
-    assert out.endswith("right, as far as these probes see\n")
+    assert out.endswith("0.80 value where cut off\nright\n")
 
 
 def action_of(name):

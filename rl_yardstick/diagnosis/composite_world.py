@@ -1,0 +1,201 @@
+"""One small world of ten short stories, and the log of what a program did in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rl_yardstick.mdp.transition_model import Floats
+
+Ints = NDArray[np.int64]
+Row = tuple[int, int, float, int, bool, bool]  # state, action, reward, shown, terminated, truncated
+
+GAMMA = 0.8
+N_STATES, N_ACTIONS = 20, 2
+END = 17  # the end of an episode shows this where it shows no other state
+PLAIN, LUCKY = 16, 18  # follow state 15 in turn
+_PAYS: Mapping[int, tuple[float, float]] = {  # rewards of the actions in each state
+    0: (1, 1),
+    1: (0.5, 0.5),
+    2: (0, 0),
+    3: (0, 0),
+    4: (2, 0),
+    5: (1, 1),
+    6: (0.6, 0.6),
+    7: (1, 1),
+    8: (4, 4),
+    9: (-3, -3),
+    10: (5, 5),
+    11: (0.5, 0),
+    12: (-3, 1),
+    13: (8, 0),
+    14: (0, 2),
+    15: (0, 0),
+    PLAIN: (0, 0),
+    LUCKY: (4, 4),
+    19: (-1, -1),
+}
+BETTER = {13: 0, 14: 1, 12: 1, 4: 0}  # the better action where they differ
+
+
+@dataclass(frozen=True)
+class Story:
+    """States that follow one another, whatever the actions, and what the end shows."""
+
+    states: tuple[int, ...]
+    shows: int = END
+    is_cut: bool = False  # truncated, not terminated
+
+
+STORIES = (
+    Story((0,), shows=7),  # terminates in front of a rich state
+    Story((1, 2, 3, 4)),
+    Story((5, 6), shows=7, is_cut=True),
+    Story((9, 10)),  # rewards beyond 1
+    Story((13,)),
+    Story((19,), shows=8, is_cut=True),
+    Story((14,)),
+    Story((7, 8)),
+    Story((11, 12)),  # the best next action is not the one taken at random
+    Story((15, PLAIN)),
+)
+
+
+class CompositeWorld(gym.Env[Any, Any]):
+    """All stories in turn, again and again.
+
+    Args:
+        log: to which each step is appended.
+        is_discrete: whether observations are state numbers, and not vectors with a one.
+        first: the story that comes first.
+        bump: the number of a step whose reward is 1 higher.
+    """
+
+    def __init__(self, log: list[Row], is_discrete: bool, first: int, bump: int) -> None:
+        self.log, self.is_discrete, self.bump = log, is_discrete, bump
+        self.story, self.place, self.round, self.state = first - 1, 0, 0, 0
+        vectors = spaces.Box(0, 1, (N_STATES,))
+        self.observation_space = spaces.Discrete(N_STATES) if is_discrete else vectors
+        self.action_space = spaces.Discrete(N_ACTIONS)
+
+    def observation_of(self, state: int) -> Any:
+        """The observation of a state."""
+        vector: NDArray[np.float32] = np.eye(N_STATES, dtype=np.float32)[state]
+        return state if self.is_discrete else vector
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """All actions are allowed: for agents that use masks."""
+        return np.ones(N_ACTIONS, np.bool_)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin the next story."""
+        super().reset(seed=seed)
+        self.story, self.place = (self.story + 1) % len(STORIES), 0
+        self.round += self.story == 0
+        self.state = STORIES[self.story].states[0]
+        return self.observation_of(self.state), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Go on in the story."""
+        story, number = STORIES[self.story], int(np.asarray(action).reshape(-1)[0])
+        reward = float(_PAYS[self.state][number]) + (len(self.log) == self.bump)
+        self.place += 1
+        is_over = self.place == len(story.states)
+        shown = story.shows if is_over else story.states[self.place]
+        if shown == PLAIN and self.round % 2:
+            shown = LUCKY
+        ends = is_over and not story.is_cut, is_over and story.is_cut
+        self.log.append((self.state, number, reward, shown, *ends))
+        self.state = shown
+        return self.observation_of(shown), reward, *ends, {}
+
+
+class Steps:
+    """A log as arrays of shape (n,), one entry for each step."""
+
+    state: Ints
+    action: Ints
+    reward: Floats
+    shown: Ints  #: the observation after the step
+    terminated: Floats  #: 1 or 0
+    truncated: Floats
+    weight: Floats  #: 1 for those that count
+
+    def __init__(self, rows: list[Row], late: float = 1.0) -> None:
+        columns = [np.array(column) for column in zip(*rows, strict=True)]
+        self.state, self.action, self.shown = columns[0], columns[1], columns[3]
+        self.reward, self.terminated, self.truncated = (columns[i] * 1.0 for i in (2, 4, 5))
+        self.over: Floats = np.maximum(self.terminated, self.truncated)
+        n = len(rows)
+        self.weight = (np.arange(n) >= int(n * (1 - late))).astype(np.float64)
+        self.next_state = np.roll(self.state, -1)  #: of the next step, also in the next episode
+        self.next_action, self.action_before = np.roll(self.action, -1), np.roll(self.action, 1)
+        self.next_reward, self.reward_before = np.roll(self.reward, -1), np.roll(self.reward, 1)
+        self.is_first: Floats = np.roll(self.over, 1)
+        self.is_first[0] = 1.0
+        choices = np.array([BETTER.get(state, -1) for state in range(N_STATES)])[self.state]
+        is_worse = (choices >= 0) & (self.action != choices)
+        smooth = np.ones(601 if n > 1200 else n)  # over time, since exploration may fall
+        near = [np.convolve(each, smooth, "same") for each in (is_worse, choices >= 0)]
+        self.exploration = np.minimum(2 * near[0] / np.maximum(near[1], 1), 1).astype(np.float64)
+
+    def take(self, places: Ints) -> Steps:
+        """Some of the steps."""
+        part = copy(self)
+        for name, each in vars(self).items():
+            setattr(part, name, each[places])
+        return part
+
+    def joined(self, other: Steps) -> Steps:
+        """These steps, and others."""
+        both = copy(self)
+        for name, each in vars(self).items():
+            setattr(both, name, np.concatenate([each, getattr(other, name)]))
+        return both
+
+    def cells(self, by_action: bool) -> Ints:
+        """The number of each step's cell: of the state, or of the state and action."""
+        return self.state * N_ACTIONS + self.action if by_action else self.state
+
+    def means(self, target: Floats, by_action: bool) -> tuple[Floats, Floats]:
+        """The weighted mean and spread of a target in each cell, (S, 2) or (S, 1); 0 if empty."""
+        cells, n = self.cells(by_action), N_STATES * (N_ACTIONS if by_action else 1)
+        total = np.maximum(np.bincount(cells, self.weight, n), 1e-9)
+        mean = np.bincount(cells, self.weight * target, n) / total
+        variance = np.bincount(cells, self.weight * (target - mean[cells]) ** 2, n) / total
+        return mean.reshape(N_STATES, -1), np.sqrt(variance).reshape(N_STATES, -1)
+
+    def counts(self, by_action: bool) -> Floats:
+        """How often each cell was visited, (S, 2) or (S, 1)."""
+        n = N_STATES * (N_ACTIONS if by_action else 1)
+        counts = np.bincount(self.cells(by_action), minlength=n).astype(np.float64)
+        return counts.reshape(N_STATES, -1)
+
+
+@dataclass
+class Copies:
+    """Makes copies of the world that begin with different stories, and holds their logs."""
+
+    is_discrete: bool
+    bump: int = -1
+    logs: list[list[Row]] = field(default_factory=list)
+
+    def __call__(self) -> CompositeWorld:
+        """One more copy."""
+        self.logs.append([])
+        first = (len(self.logs) - 1) * 4 % len(STORIES)
+        return CompositeWorld(self.logs[-1], self.is_discrete, first, self.bump)
+
+    def of_training(self) -> list[list[Row]]:
+        """The logs of copies for training, which are longer than those for evaluations."""
+        most = max(map(len, self.logs), default=0)
+        return [log for log in self.logs if 2 * len(log) > most]

@@ -1,0 +1,442 @@
+"""Subclasses of the library's DQN, PPO and A2C: one update, compared exactly with each formula's.
+
+With plain gradient descent a loss moves the parameters by a sum of gradients, of values or of
+log-probabilities, each times an error. The world's own log gives the errors of each formula.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.logger import Logger
+
+from rl_yardstick.diagnosis.backups import (
+    BACKUPS,
+    RIGHT,
+    RULES,
+    Measured,
+    fault_of,
+    fitted,
+    name_of_rule,
+    next_values,
+    parts_of,
+)
+from rl_yardstick.diagnosis.composite_world import GAMMA, N_STATES, Copies, Ints, Steps
+from rl_yardstick.diagnosis.subjects import ClassSubject, Subject
+from rl_yardstick.mdp.transition_model import Floats
+
+PROGRESS, LAMBDA, ENTROPY, TAU = 0.25, 0.9, 0.1, 0.25
+Found = tuple[str, str]  # the name of a fault, empty without one, and what shows it
+OTHERWISE = "one update moves the parameters otherwise than the right one does"
+DOES_NOT_LEARN = ("does-not-learn", "an update leaves the parameters as they were")
+
+
+def audit_update(subject: Subject) -> tuple[Measured, Found | None] | None:
+    """The measured target and the first fault of a subclass of DQN, PPO or A2C.
+
+    None for other algorithms, and those that do not take the optimizer of their settings.
+    """
+    if not (isinstance(subject, ClassSubject) and issubclass(subject.cls, DQN | PPO | A2C)):
+        return None
+    found = OfDQN(subject) if issubclass(subject.cls, DQN) else OfActor(subject)
+    if type(found.model.policy.optimizer) is not th.optim.SGD:
+        return None
+    return found.measured(), next(found.faults(), None)
+
+
+def new_model(subject: ClassSubject, **settings: Any) -> tuple[Any, Copies]:
+    """An untrained model with plain gradient descent, and the world with its log."""
+    copies = Copies(is_discrete=False)
+    given = {"policy": "MlpPolicy", **subject.typed, "engine": "library", **settings}
+    given |= {"gamma": GAMMA, "seed": 1, "device": "cpu", "env": copies(), "max_grad_norm": 1e9}
+    given |= {"policy_kwargs": {"net_arch": [32], "optimizer_class": th.optim.SGD}}
+    given |= {"learning_rate": lambda progress: progress}
+    model = subject.cls(**{name: each for name, each in given.items() if subject.named(name)})
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    return model, copies
+
+
+def parameters_of(module: Any) -> Floats:
+    """All parameters in one vector, shape (P,)."""
+    found = th.cat([each.detach().flatten() for each in module.parameters()])
+    return np.asarray(found.double().numpy().copy())
+
+
+def slopes(module: Any, numbers: th.Tensor) -> Floats:
+    """The gradients of n numbers by all parameters, shape (n, P)."""
+    rows, all_of_them = [], [*module.parameters()]
+    for number in numbers.flatten():
+        parts = th.autograd.grad(
+            number, all_of_them, retain_graph=True, allow_unused=True, materialize_grads=True
+        )
+        rows.append(th.cat([part.flatten() for part in parts]).double().numpy())
+    return np.array(rows)
+
+
+def in_evaluation(model: Any, best: Floats) -> Iterator[Found]:
+    """Whether it does its best action, (S,), when asked."""
+    seen = np.repeat(np.eye(N_STATES, dtype=np.float32), 20, axis=0)
+    share = float(np.mean(model.predict(seen, deterministic=True)[0] == np.repeat(best, 20)))
+    if share < 1:
+        fault = "acts-by-the-worst-value" if share < 0.03 else "explores-in-evaluation"
+        yield fault, f"asked for its best action, it does it in {share:.0%}"
+
+
+# --- DQN ------------------------------------------------------------------------------------------
+
+
+class OfDQN:
+    """The audit of a subclass of DQN: a batch from its memory, and what an update makes of it."""
+
+    def __init__(self, subject: ClassSubject) -> None:
+        self.subject, n = subject, 180
+        self.is_online = getattr(subject.cls, "target_kind", "") == "online"  # of the DQN of 2013
+        settings = {"learning_starts": 10**6, "target_update_interval": 10**9}
+        self.model, copies = new_model(subject, buffer_size=130, batch_size=64, **settings)
+        self.model.learn(n)
+        th.manual_seed(0)
+        eye = th.eye(N_STATES)
+        for net in (self.model.q_net, self.model.q_net_target):
+            start = parameters_of(net)
+            for _ in range(50):  # until it prefers different actions
+                noise = 0.3 * th.randn(start.size).double()
+                vector = th.as_tensor(start) + noise
+                th.nn.utils.vector_to_parameters(vector.float(), net.parameters())
+                if 0.3 < net(eye).argmax(dim=1).double().mean() < 0.7:
+                    break
+        values = self.model.q_net(eye)
+        self.slopes = slopes(self.model.q_net, values)  # (2 S, P)
+        self.q = values.detach().double().numpy()
+        self.t = self.model.q_net_target(eye).detach().double().numpy()
+        self.batch, places = self._sampled()
+        log, newer = Steps(copies.logs[0]), np.where(places < n - 130, places + 130, places)
+        self.steps, self.oldest = log.take(newer), log.take(places)
+        self.cells = self.steps.cells(by_action=True)
+
+    def _sampled(self) -> tuple[Any, Ints]:
+        """A batch, and the places of its steps in the memory."""
+        buffer, places = self.model.replay_buffer, []
+        read = buffer._get_samples
+
+        def noted(indices: Any, *rest: Any, **more: Any) -> Any:
+            places.append(indices)
+            return read(indices, *rest, **more)
+
+        buffer._get_samples = noted
+        batch = buffer.sample(64)
+        del buffer._get_samples
+        return batch, places[-1]
+
+    def _moved(self, batch: Any) -> Floats:
+        """By how much one update moves the parameters, times the steps in it."""
+        net, start = self.model.q_net, parameters_of(self.model.q_net)
+        self.model.replay_buffer.sample = lambda *args, **more: batch
+        self.model._current_progress_remaining = PROGRESS
+        self.model.train(1, 64)
+        del self.model.replay_buffer.sample
+        moved = parameters_of(net) - start
+        th.nn.utils.vector_to_parameters(th.as_tensor(start).float(), net.parameters())
+        return moved * 64 / PROGRESS
+
+    def measured(self) -> Measured:
+        """The target's coefficients, from the errors in cells that explain an update."""
+        moved = self._moved(self.batch._replace(rewards=self.batch.rewards / 10))
+        used, counts = np.unique(self.cells, return_counts=True)
+        errors, *_ = np.linalg.lstsq(self.slopes[used].T, moved, rcond=None)
+        per_step = np.zeros(self.q.size)
+        per_step[used] = errors / counts
+        told, steps = per_step[self.cells], self.steps
+        is_clear = (np.abs(told) < 0.98) & (steps.state != 15)  # not clipped, one next state
+        double = self.t[np.arange(N_STATES), self.q.argmax(axis=1)]
+        found = []
+        for values in (self.t.max(axis=1), double, self.q.max(axis=1)):
+            reward, *rest = parts_of(steps, values[steps.shown])
+            own = self.q.ravel()[self.cells]
+            found.append(fitted(told, [reward / 10, *rest], 50.0 * is_clear, own))
+        return min(found, key=lambda each: each.misfit)
+
+    def faults(self) -> Iterator[Found]:
+        """Yield the faults, the first of which explains the others."""
+        moved = self._moved(self.batch)
+        size, hits, scaled = np.linalg.norm(moved), [], []
+        if size < 1e-9:
+            yield DOES_NOT_LEARN
+        for name, direction in self._directions():
+            length = max(float(np.linalg.norm(direction)), 1e-9)
+            if abs(moved @ direction) < (1 - 1e-5) * size * length:
+                continue
+            ratio = float(np.sign(moved @ direction) * size / length)
+            if min(abs(ratio - 1), abs(ratio - 2) if "mse" in name else 1) < 2e-3:
+                hits.append(fault_of(name))
+            else:
+                scaled.append("gradient-sign-flipped" if ratio < 0 else "step-size-wrong")
+        if RIGHT not in (names := hits or scaled):
+            yield " or ".join(dict.fromkeys(names)), OTHERWISE
+        yield from self._copied()
+        yield from in_evaluation(self.model, self.q.argmax(axis=1))
+        yield from self._explored()
+
+    def _targets(self) -> dict[str, Floats]:
+        d, q, t, right = self.steps, self.q, self.t, BACKUPS[RIGHT]
+        largest, online = (next_values(each, d, "largest") for each in (t, q))
+        found = {}
+        for name, formula in BACKUPS.items():
+            found[name] = formula(d, largest)
+            found[f"{name} (double)"] = formula(d, lambda s: t[s, q[s].argmax(axis=1)])
+        found[f"{RIGHT} (online)" if self.is_online else "target-always-copied"] = right(d, online)
+        found["double-roles-swapped"] = right(d, lambda s: q[s, t[s].argmax(axis=1)])
+        for rule in RULES.keys() - {"largest", "next", "expected"}:
+            found[name_of_rule(rule, "largest")] = right(d, next_values(t, d, rule))
+        scaled = (d.reward - d.reward.mean()) / d.reward.std(ddof=1)
+        found["rewards-normalised"] = found[RIGHT] - d.reward + scaled
+        return found
+
+    def _directions(self) -> Iterator[tuple[str, Floats]]:
+        """The move of the parameters by each formula and loss."""
+        d, q, targets = self.steps, self.q, self._targets()
+        cell, own, one = d.state * 2, self.q.ravel()[self.cells], np.eye(self.q.size)
+        ahead = one[d.shown * 2 + q[d.shown].argmax(axis=1)]
+        residual = one[self.cells] - GAMMA * (1 - d.terminated)[:, None] * ahead
+        online = BACKUPS[RIGHT](d, next_values(q, d, "largest"))
+        trained = {
+            "trains-the-maximum-not-the-action": one[cell + q[d.state].argmax(axis=1)],
+            "gather-of-action-0": one[cell],
+            "gather-of-action-1": one[cell + 1],
+            "gather-of-the-other-action": one[cell + 1 - d.action],
+            "action-of-another-step": one[cell + d.action_before],
+            "action-of-another-step (after)": one[cell + d.next_action],
+            "trains-the-mean-of-actions": (one[cell] + one[cell + 1]) / 2,
+        }
+        for loss, most in (("huber", 1.0), ("mse", np.inf)):
+            for name, target in targets.items():
+                yield (
+                    f"{name} ({loss})",
+                    np.clip(target - own, -most, most) @ self.slopes[self.cells],
+                )
+                if fault_of(name) == RIGHT:
+                    for fault, place in trained.items():
+                        errors = np.clip(target - place @ q.ravel(), -most, most)
+                        yield f"{fault} ({loss})", errors @ place @ self.slopes
+            every = np.clip(targets[RIGHT][:, None] - own, -most, most).mean(axis=0)
+            yield f"loss-broadcasts-over-the-batch ({loss})", every @ self.slopes[self.cells]
+            errors = np.clip(online - own, -most, most)
+            yield f"target-not-detached ({loss})", errors @ residual @ self.slopes
+        old, places = self.oldest, self.oldest.cells(by_action=True)
+        errors = BACKUPS[RIGHT](old, next_values(self.t, old, "largest")) - q.ravel()[places]
+        yield "stale-buffer", np.clip(errors, -1, 1) @ self.slopes[places]
+        yield f"{RIGHT} (absolute)", np.sign(targets[RIGHT] - own) @ self.slopes[self.cells]
+
+    def _copied(self) -> Iterator[Found]:
+        """Whether the target network moves when it should, and how far."""
+        settings = {"learning_starts": 10, "buffer_size": 200, "train_freq": 1}
+        for interval, n, fault in (
+            ()
+            if self.is_online
+            else (
+                (1, 5, "target-mixed-wrongly"),
+                (10, 40, "target-never-copied"),
+                (10**9, 40, "target-always-copied"),
+            )
+        ):
+            share = TAU if n == 5 else 1.0
+            mine = {"target_update_interval": interval, "tau": share, **settings}
+            model, _ = new_model(self.subject, **mine)
+            before = parameters_of(model.q_net_target)
+            model.learn(n)
+            if n == 5:  # nothing is learnt yet: the networks are the same
+                one_more = th.as_tensor(before + 1).float()
+                th.nn.utils.vector_to_parameters(one_more, model.q_net.parameters())
+                model._on_step()
+            moved = float(np.abs(parameters_of(model.q_net_target) - before).mean())
+            is_right = (moved == 0) == (interval == 10**9)
+            if not is_right or (n == 5 and abs(moved - TAU) > 1e-3):
+                name = "target-never-copied" if moved == 0 else fault
+                yield name, f"the target network moves by {moved:.3g} within {n} steps"
+
+    def _explored(self) -> Iterator[Found]:
+        falls = {"exploration_initial_eps": 0.9, "exploration_final_eps": 0.1}
+        falls |= {"exploration_fraction": 0.5, "learning_starts": 10**6}
+        model, _ = new_model(self.subject, **falls)
+        model.learn(10)
+        rate = model.exploration_rate
+        if abs(rate - 0.1) > 1e-3:
+            yield "exploration-schedule", f"exploration ends at {rate:.2f}; right would be 0.10"
+
+
+# --- PPO and A2C ----------------------------------------------------------------------------------
+
+
+class OfActor:
+    """The audit of a subclass of PPO or A2C: its rollout, and what an update makes of it."""
+
+    def __init__(self, subject: ClassSubject) -> None:
+        self.subject, n = subject, 94  # the last step is inside an episode
+        self.is_ppo, self.n = issubclass(subject.cls, PPO), n
+        settings = {"n_steps": n, "batch_size": n, "n_epochs": 1, "gae_lambda": LAMBDA}
+        settings |= {"ent_coef": ENTROPY, "vf_coef": 0.5, "use_rms_prop": False}
+        self.model, copies = new_model(subject, **settings)
+        self.policy = self.model.policy
+        with th.no_grad():
+            for each in self.policy.parameters():
+                each.add_(0.3 * th.randn_like(each))
+        self.model.train = lambda: None
+        self.model.learn(n)
+        del self.model.train
+        self.steps = d = Steps(copies.logs[0][:n])
+        d.next_state[-1] = d.shown[-1]
+        self.advantages = self.model.rollout_buffer.advantages[:, 0].astype(float)
+        with th.no_grad():
+            told = self.policy.predict_values(th.eye(N_STATES))[:, 0]
+        self.v: Floats = np.asarray(told.double().numpy())
+
+    def measured(self) -> Measured:
+        """The target's coefficients, from the advantages."""
+        d, after = self.steps, np.append(self.advantages[1:], 0.0)
+        told = self.advantages - GAMMA * LAMBDA * (1 - d.over) * after + self.v[d.state]
+        return fitted(told, parts_of(d, self.v[d.shown]), np.full(self.n, 50.0))
+
+    def faults(self) -> Iterator[Found]:
+        """Yield the faults, the first of which explains the others."""
+        table = self._advantages()
+        names = [fault_of(name) for name, each in table.items() if self._is_near(each)]
+        if RIGHT not in names:
+            off = int((~np.isclose(self.advantages, table[RIGHT], atol=1e-4)).sum())
+            told = f"stored advantages differ in {off} of {self.n} steps"
+            yield " or ".join(dict.fromkeys(names)), told
+        self.of_all_steps = table["lambda-missing"]
+        yield from self._updated()
+        if self.is_ppo:
+            yield from self._minibatches()
+        with th.no_grad():
+            best = self.policy.get_distribution(th.eye(N_STATES)).mode().numpy()
+        yield from in_evaluation(self.model, best)
+
+    def _is_near(self, advantages: Floats) -> bool:
+        return np.allclose(self.advantages, advantages, atol=1e-4)
+
+    def _advantages(self) -> dict[str, Floats]:
+        """The advantages of a rollout, by each formula of targets and of traces."""
+        d, found = self.steps, dict[str, Floats]()
+        on, fade, v = 1 - d.over, GAMMA * LAMBDA, next_values(self.v[:, None], d, "")
+        keeps = {
+            "": fade * on,
+            "trace-leaks-into-the-next-episode": fade * (on + d.over),
+            "trace-leaks-at-truncation": fade * (1 - d.terminated),
+            "done-flag-off-by-one": fade * (1 - d.is_first),
+            "lambda-missing": GAMMA * on,
+            "lambda-zero": 0 * on,
+            "discount-missing-in-the-trace": LAMBDA * on,
+            "discount-twice-in-the-trace": GAMMA * fade * on,
+            "lambda-twice": LAMBDA * fade * on,
+        }
+        targets = {name: formula(d, v) for name, formula in BACKUPS.items()}
+        targets["last-value-missing"] = targets[RIGHT].copy()
+        targets["last-value-missing"][-1] = d.reward[-1]
+        for kept, keep in keeps.items():
+            for name, target in targets.items():
+                errors, total = target - self.v[d.state], np.zeros(self.n + 1)
+                for k in reversed(range(self.n)):
+                    total[k] = errors[k] + keep[k] * total[k + 1]
+                label = name if not kept else kept if name == RIGHT else f"{name} ({kept})"
+                found[label] = total[:-1]
+        right = found[RIGHT]
+        found["advantage-sign"] = -right
+        found["advantages-normalised-over-the-rollout"] = (right - right.mean()) / right.std()
+        return found
+
+    def _weights(self, ratio: Floats, a: Floats) -> dict[str, Floats]:
+        """The weight of each log-probability's gradient, by each form of the policy's loss."""
+        if not self.is_ppo:
+            return {RIGHT: a, "advantage-missing": 0 * a + 1}
+        low, high, turned = ratio < 0.8, ratio > 1.2, 1 / ratio
+        is_best = (a > 0) & high | (a < 0) & low
+        return {
+            RIGHT: a * ratio * ~is_best,
+            "clip-missing": a * ratio,
+            "clip-on-the-wrong-side": a * ratio * ~((a > 0) & low | (a < 0) & high),
+            "clip-without-minimum": a * ratio * ~(low | high),
+            "clip-above-only": a * ratio * ~((a > 0) & high),
+            "ratio-inverted": -a * turned * ~((a > 0) & (turned > 1.2) | (a < 0) & (turned < 0.8)),
+            "ratio-missing": a,
+            "advantage-missing": ratio,
+        }
+
+    def _updated(self) -> Iterator[Found]:
+        d, n, policy, a = self.steps, self.n, self.policy, self.advantages
+        noise = np.tile([0.4, -0.1, -0.4, 0.1, 0.3, -0.3], n)[:n]
+        self.model.rollout_buffer.log_probs[:, 0] += noise  # else no ratio differs from 1
+        seen = th.eye(N_STATES)[d.state], th.as_tensor(d.action)
+        values, logs, entropies = policy.evaluate_actions(*seen)
+        gains, of_values = slopes(policy, logs) / n, slopes(policy, values) / n
+        of_entropy, before = ENTROPY * slopes(policy, entropies.mean())[0], parameters_of(policy)
+        self.model._current_progress_remaining = PROGRESS
+        self.model.train()
+        moved = (parameters_of(policy) - before) / PROGRESS
+        if (size := np.linalg.norm(moved)) < 1e-9:
+            yield DOES_NOT_LEARN
+        own, scaled = self.v[d.state], (a - a.mean()) / (a.std(ddof=1) + 1e-8)
+        returns = a + own
+        critics = {
+            RIGHT: a,
+            f"{RIGHT} (of all steps)": self.of_all_steps,
+            f"{RIGHT} (huber)": np.clip(a, -1, 1),
+            "loss-broadcasts-over-the-batch": returns.mean() - own,
+            "value-target-is-the-advantage": a - own,
+            "returns-subtract-the-value": a - 2 * own,
+            "returns-normalised": (returns - returns.mean()) / (returns.std() + 1e-8) - own,
+        }
+        forms = {RIGHT: scaled if self.is_ppo else a}
+        forms["advantage-normalisation"] = a if self.is_ppo else scaled
+        found = []
+        for form, advantages in forms.items():
+            for name, weights in self._weights(np.exp(-noise), advantages).items():
+                for critic, error in critics.items():
+                    matrix = np.array([weights @ gains, of_entropy, error @ of_values]).T
+                    sizes, *_ = np.linalg.lstsq(matrix, moved, rcond=None)
+                    if np.linalg.norm(matrix @ sizes - moved) < 2e-3 * size:
+                        names = [each for each in (name, form, fault_of(critic)) if each != RIGHT]
+                        found.append((len(names), " and ".join(names), sizes))
+        if not found:
+            yield "", OTHERWISE
+            return
+        _, name, sizes = min(found, key=lambda each: each[0])
+        yield from self._sized(name, sizes)
+
+    def _sized(self, name: str, sizes: Floats) -> Iterator[Found]:
+        """The fault of an update whose parts have these step sizes; 1 would be right."""
+        policy, entropy, value = sizes
+        told = f"steps of policy, entropy, values: {policy:.2f}, {entropy:.2f}, {value:.2f} times"
+        spread = self.advantages.std(ddof=1)
+        checks = {
+            name: bool(name),
+            "gradient-sign-flipped": max(sizes) < 0,
+            "policy-never-learns": abs(policy) < 1e-3,
+            "advantage-sign": policy < 0,
+            "value-loss-missing": abs(value) < 1e-3,
+            "entropy-missing": abs(entropy) < 1e-3,
+            "entropy-sign": entropy < 0,
+            "advantage-normalised-without-std": abs(policy / spread / entropy - 1) < 0.02,
+            "entropy-weight": abs(entropy / policy - 1) > 0.02,
+            "step-size-wrong": abs(policy - 1) > 0.01 or not 0.4 < value < 2.1,
+        }
+        yield from ((fault, told) for fault, is_there in checks.items() if is_there)
+
+    def _minibatches(self) -> Iterator[Found]:
+        model, _ = new_model(self.subject, n_steps=96, batch_size=32, n_epochs=3)
+        seen, evaluate = list[bytes](), model.policy.evaluate_actions
+
+        def noted(observations: Any, actions: Any) -> Any:
+            seen.append(observations.numpy().tobytes() + actions.numpy().tobytes())
+            return evaluate(observations, actions)
+
+        model.policy.evaluate_actions = noted
+        model.learn(96)
+        if (len(set(seen)), len(seen)) != (9, 9):
+            told = (
+                f"{len(set(seen))} different minibatches in {len(seen)} updates; right would be 9"
+            )
+            yield "minibatches-reused" if len(seen) == 9 else "minibatches-or-epochs", told
