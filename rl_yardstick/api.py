@@ -47,7 +47,7 @@ from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.diagnosis import audit as audits
 from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.diagnosis.explanation import explanation
-from rl_yardstick.envs import known_models
+from rl_yardstick.envs import found_models, known_models
 from rl_yardstick.experiments.plan import StudyRecord, specs_of
 from rl_yardstick.experiments.pool import REGISTRATIONS
 from rl_yardstick.experiments.results import read_evaluations
@@ -385,6 +385,7 @@ def _at_work(verbose: int = 1) -> Iterator[tuple[TextConsole, Stop]]:
     except OSError as error:
         raise UserError(f"{error.filename or 'a file'}: {error.strerror or error}") from error
     finally:
+        found_models.limit("auto")
         main.update({name: value for name, value in hidden.items() if value is not None})
         for number, handler in handlers.items():
             if signal.getsignal(number) is not handler:
