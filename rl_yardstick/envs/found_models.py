@@ -158,6 +158,8 @@ def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
             more = f"--model {10 * limits.states} to continue"
             return NotFound(f"{error}; {more}", ends_at_limit=True)
         return NotFound(str(error))
+    except (Exception, SystemExit) as error:  # noqa: BLE001  # its code may do anything
+        return NotFound(f"it raised {type(error).__name__}: {' '.join(str(error).split())}")
     model, observations = _legal(found), _stacked(env.observation_space, found)
     notes = tuple(found.notes)
     return FoundClaim(model, found.mask, observations, found.horizon, notes, found.seconds)
@@ -214,7 +216,7 @@ def _first_steps(env: Any) -> Iterator[Any]:
                 yield env.reset(seed=step)[0]
             try:
                 result = env.step(env.action_space.start + rng.integers(env.action_space.n))
-            except Exception as error:  # noqa: BLE001  # an action may not be allowed
+            except (Exception, SystemExit) as error:  # noqa: BLE001  # it may not be allowed
                 yield str(error)
                 return
             yield result[:4]

@@ -46,7 +46,8 @@ def test_the_optimal_agent_keeps_the_time_of_each_episode_apart():
 
 
 def test_plans_need_a_model_and_the_optimum_a_time_limit():
-    unknown = gym.wrappers.TransformReward(gym.make("FrozenLake-v1"), float)
+    changes = {"maze": "blocking", "changed": True, "change_after_steps": 9}
+    unknown = gym.make("DynaMaze-v0", **changes)
     with pytest.raises(ValueError, match="transition model is known"):
         load_algorithm("value_iteration")(env=unknown).learn(1)
     with pytest.raises(ValueError, match="needs a time limit"):
