@@ -221,7 +221,7 @@ CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": "auto"}}
 SCALE = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": "auto"}}
 SHORT = {"max_episode_steps": 200}
 # Nobody knows the model of what depends on earlier actions.
-STICKY = {"env_wrapper": {"gymnasium.wrappers.StickyAction": {"repeat_action_probability": 0.2}}}
+CHANGES = {"env_kwargs": {"maze": "blocking", "changed": True, "change_after_steps": 9}}
 POOR = {"shelf_reward": -1, "step_reward": -0.01, "goal_reward": 1}
 
 
@@ -257,8 +257,8 @@ def test_the_dearest_step_of_training_costs_a_tenth_of_the_goal():
 @pytest.mark.parametrize(
     ("env_id", "raw", "said"),
     [
-        ("FrozenLake-v1", {"initial_q": "auto", **STICKY}, "initial_q: auto needs a known model"),
-        ("FrozenLake-v1", {"train_env_wrapper": [SCALE], **STICKY}, "scale: auto needs an env"),
+        ("DynaMaze-v0", {"initial_q": "auto", **CHANGES}, "initial_q: auto needs a known model"),
+        ("DynaMaze-v0", {"train_env_wrapper": [SCALE], **CHANGES}, "scale: auto needs an env"),
         ("CartPole-v1", {"n_timesteps": "auto"}, "qlearning does not fit CartPole-v1"),
     ],
 )
