@@ -22,10 +22,11 @@ from rl_yardstick.envs.model_of.symbols import NORMAL, TAIL, UNIFORM, Drawn, Sto
 NEVER = 1 << 60  # a time that no episode reaches
 MOST = 20_000  # branches of one draw
 LEAST_CHANCE = 1e-13  # branches of a lower probability are cut off
+CUT_OFF = -1
 
 
 class Again(BaseException):
-    """A loop has come back to the draw after so many branches; -1: its chance is too low."""
+    """A loop has come back to the draw after so many branches; or `CUT_OFF`."""
 
 
 class Suspect(BaseException):
@@ -62,7 +63,7 @@ class Script:
         self.trace.append((choice, shares))
         self.chance *= shares[choice]
         if self.chance < LEAST_CHANCE and depth >= self.root:
-            raise Again(-1)
+            raise Again(CUT_OFF)
         return choice
 
     def visit(self) -> None:
