@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -245,13 +245,11 @@ def _read(file: Path) -> FoundClaim | NotFound | None:
 
 def _write(file: Path, result: FoundClaim | NotFound) -> None:
     """Write a file, and remove all but the newest; nothing where the folder cannot be written."""
-    arrays, told = dict[str, Any](), dict[str, Any]()
-    if isinstance(result, NotFound):
-        told = asdict(result)
-    else:
-        told = {key: getattr(result, key) for key in ("horizon", "notes", "seconds")}
-        arrays = {each.name: getattr(result.model, each.name) for each in fields(TransitionModel)}
-        arrays |= {"mask": result.mask, "observations": result.observations}
+    told = dict(vars(result))
+    arrays = {name: told.pop(name, None) for name in ("mask", "observations")}
+    if isinstance(result, FoundClaim):
+        model = told.pop("model")
+        arrays |= {each.name: getattr(model, each.name) for each in fields(model)}
     kept = {name: array for name, array in arrays.items() if array is not None}
     with suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -171,7 +171,7 @@ class Search:
             observation, _ = self.state.layers[0].reset(seed=seed)
             self.put(True)
             chances[Outcome(self._number(observation, is_reset=True), 0.0)] += 1 / len(self.seeds)
-        return dict(chances)
+        return chances
 
     def refuse_start(self, variables: Saved) -> None:
         """Name the attribute that no start of an episode has."""
@@ -226,8 +226,7 @@ class Search:
         state = self.state
         state.restore(saved)
         observation, reward, terminated, truncated = take_step(state.layers[0], action)
-        if isinstance(reward, np.ndarray):
-            reward = reward.item()
+        reward = reward.item() if isinstance(reward, np.ndarray) else reward
         moments = reward.moments() if isinstance(reward, Drawn) else (float(reward), 0.0)
         if terminated or truncated:
             state.variables()

@@ -292,8 +292,6 @@ class State:
         """Something hashable that is equal for equal values."""
         if isinstance(value, SIMPLE):
             return value
-        if type(value) is np.ndarray and value.dtype != object:
-            return value.dtype.char, value.shape, value.tobytes()
         file = io.BytesIO()
         ByValue(file, self).dump(value)
         return file.getvalue()
