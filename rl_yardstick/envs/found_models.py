@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -91,7 +91,6 @@ class NotFound:
     ends_at_limit: bool = False  #: whether a longer search might find one
 
 
-_NOTHING = NotFound("")
 _of_object: WeakKeyDictionary[Env, tuple[Limits, FoundClaim | NotFound]] = WeakKeyDictionary()
 _of_name: dict[str, FoundClaim | NotFound] = {}
 
@@ -105,19 +104,16 @@ def found(core: Env) -> FoundClaim | NotFound | None:
     is_own &= not isinstance(core, gym.Wrapper)
     if wanted is None or is_own or not isinstance(core.action_space, gym.spaces.Discrete):
         return None
-    searched, result = _of_object.get(core, (None, _NOTHING))
-    if searched != wanted:
-        result = _by_name(core, wanted)
-        _of_object[core] = wanted, result
-    return result
+    if core not in _of_object or _of_object[core][0] != wanted:
+        _of_object[core] = wanted, _by_name(core, wanted)
+    return _of_object[core][1]
 
 
 def _by_name(core: Env, limits: Limits) -> FoundClaim | NotFound:
     """The result of an earlier search in the same code, or of a new one."""
     try:
-        twin, name = copy_of(core), None
-        if core.spec is not None:
-            name = _name_of(twin, limits)
+        twin = copy_of(core)
+        name = None if core.spec is None else _name_of(twin, limits)
     except Exception as error:  # noqa: BLE001  # the environment may raise any
         return NotFound(f"the environment cannot be copied: {' '.join(str(error).split())}")
     if name is None:
@@ -150,14 +146,13 @@ def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
             seconds=limits.seconds,
             max_states=limits.states,
             ignore=limits.ignored,
-            starts=limits.starts or None,
+            starts=limits.starts,
             progress=progress,
         )
     except NotFinite as error:
-        if isinstance(error, Unfinished):
-            more = f"--model {10 * limits.states} to continue"
-            return NotFound(f"{error}; {more}", ends_at_limit=True)
-        return NotFound(str(error))
+        is_limit = isinstance(error, Unfinished)
+        more = f"; --model {10 * limits.states} to continue" if is_limit else ""
+        return NotFound(f"{error}{more}", is_limit)
     except (Exception, SystemExit) as error:  # noqa: BLE001  # its code may do anything
         return NotFound(f"it raised {type(error).__name__}: {' '.join(str(error).split())}")
     model, observations = _legal(found), _stacked(env.observation_space, found)
@@ -173,10 +168,8 @@ def _legal(found: FoundModel) -> TransitionModel:
     states = np.arange(model.n_states)[:, None]
     action = np.where(mask, np.arange(model.n_actions), mask.argmax(axis=1)[:, None])
     arrays: dict[str, Any] = {each.name: getattr(model, each.name) for each in fields(model)}
-    for name, array in arrays.items():
-        if name != "initial" and array is not None:
-            arrays[name] = array[states, action]
-    return TransitionModel(**arrays)
+    of_pairs = {name for name, array in arrays.items() if name != "initial" and array is not None}
+    return replace(model, **{name: arrays[name][states, action] for name in of_pairs})
 
 
 def _stacked(space: Any, found: FoundModel) -> NDArray[Any] | None:
@@ -254,13 +247,11 @@ def _read(file: Path) -> FoundClaim | NotFound | None:
 
 def _write(file: Path, result: FoundClaim | NotFound) -> None:
     """Write a file, and remove all but the newest; nothing where the folder cannot be written."""
-    arrays, told = dict[str, Any](), dict[str, Any]()
-    if isinstance(result, NotFound):
-        told = asdict(result)
-    else:
-        told = {key: getattr(result, key) for key in ("horizon", "notes", "seconds")}
-        arrays = {each.name: getattr(result.model, each.name) for each in fields(TransitionModel)}
-        arrays |= {"mask": result.mask, "observations": result.observations}
+    told = dict(vars(result))
+    arrays = {name: told.pop(name, None) for name in ("mask", "observations")}
+    if isinstance(result, FoundClaim):
+        model = told.pop("model")
+        arrays |= {each.name: getattr(model, each.name) for each in fields(model)}
     kept = {name: array for name, array in arrays.items() if array is not None}
     with suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -33,9 +33,8 @@ Env = gym.Env[Any, Any]
 
 TRUSTED_CLASSES = (FrozenLakeEnv, CliffWalkingEnv, TaxiEnv, BlackjackEnv)
 OWN_CLASSES = (ClickBandit, FiniteEnv)
-N_TRIES = 500  # at setting the state, and at drawing as toy_text does
+N_TRIES = 250  # at setting the state, and at drawing as toy_text does
 STEPS_PER_PAIR = 3  # of a state and an action, where the state can be set
-EPISODE_LIMIT = 1000
 STEPS_IN_TURN = 10
 
 
@@ -147,17 +146,18 @@ def checked(claim: Claim) -> ModelCheck:
 
 
 def _check(claim: Claim) -> ModelCheck:
-    model, states = claim.model, np.flatnonzero(claim.model.reachable)
+    model = claim.model
     try:
         played = Played(copy_of(claim.base), claim)
         problem = refutation(played, model, played.state, played.actions)
         with seeded_globally(0):
-            alike, can_be_set = (False, False) if problem else played.follows()
+            can_be_set = problem is None and played.can_be_set()
+            alike = problem is None and played.draws_alike()
         if can_be_set:
-            anywhere = replace(model, initial=model.reachable / len(states))
-            steps = max(STEPS, STEPS_PER_PAIR * len(states) * model.n_actions)
-            from_anywhere = FromAnywhere(played, states)
-            problem = refutation(from_anywhere, anywhere, played.state, played.actions, steps=steps)
+            played.starts = np.flatnonzero(model.reachable)
+            anywhere = replace(model, initial=model.reachable / len(played.starts))
+            steps = max(STEPS, STEPS_PER_PAIR * len(played.starts) * model.n_actions)
+            problem = refutation(played, anywhere, played.state, played.actions, steps=steps)
     except Exception as error:  # noqa: BLE001  # the environment may raise any
         text = " ".join(f"step, which raised {type(error).__name__}: {error}".split())
         return ModelCheck(f"the environment's P cannot be held against {text}")
@@ -187,20 +187,28 @@ class Played(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env: Any, claim: Claim) -> None:
         super().__init__(env)
         self.model, self.observations = claim.model, claim.observations
-        self.actions = list(range(claim.model.n_actions))
-        states = np.arange(self.model.n_states)
-        self.observes_states = np.array_equal(
-            states, states[:0] if self.observations is None else self.observations
-        )
+        self.actions = list(range(self.model.n_actions))
+        shown: Any = self.observations
+        self.observes_states = np.array_equal(np.arange(self.model.n_states), shown)
         self.now, self.seen = 0, set[tuple[int, int]]()
+        self.starts: Ints | None = None  # of episodes of one step, if the state can be set
+        self.rng = np.random.default_rng(0)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """As the environment, or in one of the starts."""
+        result = self.env.reset(seed=seed)
+        if self.starts is None:
+            return result
+        state = self.env.s = self.rng.choice(self.starts)
+        return state if self.observations is None else self.observations[state], {}
 
     def step(self, action: Any) -> Any:
         """As the environment; ValueError where it ends an episode by time."""
         self.seen.add((self.now, action))
-        result = self.env.step(action)
-        if result[3]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if truncated:
             raise ValueError("it gave truncated: leave time limits to max_episode_steps")
-        return result
+        return observation, reward, terminated, self.starts is not None, info
 
     def state(self, observation: Any, _time: int = 0) -> int | None:
         """The number of the present state, by the observation or ``s``; None if it has none."""
@@ -208,87 +216,56 @@ class Played(gym.Wrapper[Any, Any, Any, Any]):
         state = operator.index(found) if hasattr(found, "__index__") else -1
         if not 0 <= state < self.model.n_states:
             return None
-        shown = None if self.observes_states or self.observations is None else self.observations
+        shown = self.observations
         if shown is not None and not np.array_equal(shown[state], observation):
             return None
         self.now = state
         return state
 
-    def number(self, observation: Any) -> int:
-        """As `state`, which is known to have a number."""
-        state = self.state(observation)
-        assert state is not None
-        return state
+    def outcome(self, action: int) -> tuple[int | None, float, bool]:
+        """What a step of the environment leads to: next state, reward, termination."""
+        observation, reward, terminated, *_ = self.env.step(action)
+        return self.state(observation), float(np.float32(reward)), bool(terminated)
 
-    def follows(self) -> tuple[bool, bool]:
-        """Whether it draws as toy_text does, and whether setting ``s`` sets the whole state.
+    def draws_alike(self) -> bool:
+        """Whether it draws as toy_text does."""
+        for seed in range(N_TRIES):
+            uniforms = seeding.np_random(seed)[0]
+            drawn: Any = first_above(self.model.initial.cumsum(), uniforms.random()), 0.0, False
+            seen: Any = self.state(self.env.reset(seed=seed)[0]), 0.0, False
+            for action in self.rng.integers(self.model.n_actions, size=STEPS_IN_TURN).tolist():
+                if seen != drawn:
+                    return False
+                if seen[2]:
+                    break
+                drawn = _outcomes(self.model, seen[0], action, uniforms.random())[1]
+                seen = self.outcome(action)
+        return True
+
+    def can_be_set(self) -> bool:
+        """Whether setting ``s`` sets the whole state.
 
         Tried are states and actions that episodes have seen: there, the model is right.
         """
-        model, rng, pairs = self.model, np.random.default_rng(0), sorted(self.seen)
-        alike, alike_if_set, was_set = True, True, model.n_states == 1
-        for seed in range(N_TRIES):
-            uniforms, sets = seeding.np_random(seed)[0], seed % 2 == 1
-            begun = state = self.number(self.env.reset(seed=seed)[0])
-            alike &= state == first_above(model.initial.cumsum(), uniforms.random())
-            for _ in range(1 if sets else STEPS_IN_TURN):
-                action = int(rng.integers(model.n_actions))
-                if sets:
-                    state, action = pairs[rng.integers(len(pairs))]
-                    self.env.s = state
-                try:
-                    result = self.env.step(action)
-                except Exception:  # noqa: BLE001  # it may refuse the state in any way
-                    return alike, False
-                said, drawn = _outcomes(model, state, action, uniforms.random())
-                seen = self.number(result[0]), np.float32(result[1]), bool(result[2])
-                if seen not in said:
-                    return alike, False
-                if sets:
-                    alike_if_set &= seen == drawn
-                    was_set |= seen not in _outcomes(model, begun, action, 0)[0]
-                    break
-                alike &= seen == drawn
-                state = seen[0]
-                if seen[2]:
-                    break
-        return alike and (alike_if_set or not was_set), was_set
-
-
-class FromAnywhere(gym.Wrapper[Any, Any, Any, Any]):
-    """Episodes of one step from any of the states given."""
-
-    env: Played
-
-    def __init__(self, env: Played, states: Ints) -> None:
-        super().__init__(env)
-        self.states, self.rng, self.n_steps, self.is_over = (
-            states,
-            np.random.default_rng(0),
-            0,
-            True,
-        )
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """Set the state; the environment begins anew only after an end."""
-        if self.is_over or self.n_steps % EPISODE_LIMIT == 0:
-            self.env.reset(seed=seed)
-        state = self.env.env.s = self.states[self.rng.integers(len(self.states))]
-        return state if self.env.observations is None else self.env.observations[state], {}
-
-    def step(self, action: Any) -> Any:
-        """As the environment, and the end of the episode."""
-        observation, reward, self.is_over, _, info = self.env.step(action)
-        self.n_steps += 1
-        return observation, reward, self.is_over, True, info
+        was_set, pairs = self.model.n_states == 1, sorted(self.seen)
+        for i in self.rng.integers(len(pairs), size=N_TRIES).tolist():
+            begun: Any = self.state(self.env.reset()[0])
+            state, action = pairs[i]
+            self.env.s = state
+            try:
+                seen = self.outcome(action)
+            except Exception:  # noqa: BLE001  # it may refuse the state in any way
+                return False
+            if seen not in _outcomes(self.model, state, action, 0.0)[0]:
+                return False
+            was_set |= seen not in _outcomes(self.model, begun, action, 0.0)[0]
+        return was_set
 
 
 def _outcomes(model: TransitionModel, state: int, action: int, uniform: float) -> tuple[Any, Any]:
     """What an action can lead to, and what toy_text draws: next state, reward, termination."""
-    at = state, action
-    rows = zip(
-        model.next_state[at], model.reward[at].astype(np.float32), model.terminated[at], strict=True
-    )
-    outcomes = [(int(after), reward, bool(ends)) for after, reward, ends in rows]
-    possible = {outcome for outcome, p in zip(outcomes, model.prob[at], strict=True) if p > 0}
-    return possible, outcomes[first_above(model.prob[at].cumsum(), uniform)]
+    at, chances = (state, action), model.prob[state, action]
+    parts = model.next_state[at], np.float32(model.reward[at]), model.terminated[at]
+    outcomes = list(zip(*(part.tolist() for part in parts), strict=True))
+    drawn = outcomes[first_above(chances.cumsum(), uniform)]
+    return [outcomes[k] for k in np.flatnonzero(chances > 0)], drawn

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
-from rl_yardstick.envs import checking as model_checks
+from rl_yardstick.envs import published_models
 from rl_yardstick.envs import wrappers as wrap
 from rl_yardstick.envs.grid import Tile
 from rl_yardstick.envs.known_models import transition_model
@@ -198,10 +198,9 @@ def lake(**kwargs):
 
 
 @pytest.fixture(autouse=True)
-def few_steps(monkeypatch):
-    """Checks of a model take many steps, and are kept."""
-    monkeypatch.setattr(model_checks, "N_STEPS", 5_000)
-    monkeypatch.setattr(model_checks, "_checks", {})
+def nothing_is_checked(monkeypatch):
+    """Each test checks models anew."""
+    monkeypatch.setattr(published_models, "_checks", {})
 
 
 def calm():
@@ -211,7 +210,7 @@ def calm():
 
 INTERPRETED = {  # reason: environment, settings, callback
     "VecNormalize is not DummyVecEnv": (lambda: VecNormalize(lake(), norm_obs=False),),
-    "the environment's transition model is not known": (partial(lake, wrapper_class=gym.Wrapper),),
+    "Wrapper must see every step$": (partial(lake, wrapper_class=gym.Wrapper),),
     "rewards are drawn, and the environment's model": (partial(gym.make, "MaximizationBias-v0"),),
     "the environments are not alike": (
         lambda: DummyVecEnv([lambda: gym.make(LAKE), lambda: gym.make(LAKE, is_slippery=False)]),),

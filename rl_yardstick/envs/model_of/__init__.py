@@ -20,7 +20,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from rl_yardstick.envs.model_of.check import refutation
 from rl_yardstick.envs.model_of.draws import Script, scripted
@@ -52,7 +51,7 @@ class FoundModel:
     model: TransitionModel
     mask: Bools | None  # actions that raise no error, bool of shape (S, A); None if all
     observations: list[Any]  # what each state shows
-    actions: list[Any]  # of the environment, in the order of the model
+    actions: list[int]  # of the environment, in the order of the model
     horizon: int | None  # the environment's own limit on steps
     notes: list[str]  # what a reader of the figures should know
     seconds: float
@@ -82,7 +81,10 @@ def model_of(
     Raises:
         NotFinite: if there is no finite model, or the environment does not follow the one found.
     """
-    actions = _actions_of(env.action_space)
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Discrete) or space.n > MOST_ACTIONS:
+        raise NotFinite(f"the action space {space} is not `Discrete` with up to {MOST_ACTIONS:,}")
+    actions = [int(space.start + i) for i in range(int(space.n))]
     state = State(env, Script(), ignore)
     search = Search(state, actions, seconds, max_states, progress, starts or ())
     try:
@@ -140,13 +142,3 @@ def _modules(layers: list[gym.Env[Any, Any]]) -> list[Any]:
     }
     near = set().union(*(places[kind.__module__] for kind in kinds)) - {Path()}
     return [sys.modules[name] for name, place in places.items() if place & near]
-
-
-def _actions_of(space: gym.Space[Any]) -> list[Any]:
-    """All actions of a finite space."""
-    if isinstance(space, spaces.Discrete) and space.n <= MOST_ACTIONS:
-        return [int(space.start + i) for i in range(int(space.n))]
-    if isinstance(space, spaces.MultiDiscrete) and np.prod(space.nvec) <= MOST_ACTIONS:
-        values = itertools.product(*(range(n) for n in space.nvec.ravel()))
-        return [np.array(value).reshape(space.nvec.shape) + space.start for value in values]
-    raise NotFinite(f"the action space {space} is not finite, or has over {MOST_ACTIONS:,} actions")

@@ -7,8 +7,10 @@ first outcomes of all states and actions together, the second ones, and so on.
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -23,10 +25,11 @@ MOST_DEVIATIONS = 6.0
 LEGAL = 0.95  # share of steps for which an action is chosen that is allowed
 FEWEST = 9.0  # a variance below which counts are far from normally distributed
 
+
 NO_START = "the environment starts in a state ({}) that is no start"
-START = (-1, 0)  # the place of `reset` among states and actions
-# Of each state and action: {(next state, -1 at the end; reward, None if random): [chance, count]}.
-Counts = dict[tuple[int, int], dict[Any, list[float]]]
+# Of a start, or of a state and action: {(next state, -1 at the end; reward, None if random):
+# [probability, count]}.
+Row = dict[tuple[int | None, float | None], list[float]]
 
 
 @contextmanager
@@ -63,72 +66,60 @@ def refutation(
         steps: how many steps to play.
         seed: of the environment, the actions and the global generators, which are restored.
     """
+    rng, initial, state, time = np.random.default_rng(seed), model.initial, None, 0
+    starts: Row = {(s, 0.0): [initial[s], 0.0] for s in np.flatnonzero(initial).tolist()}
+    rows = {"reset": starts}
     with seeded_globally(seed):
-        return _refutation(env, model, state_of, actions, mask, steps, seed)
-
-
-def _refutation(
-    env: gym.Env[Any, Any],
-    model: TransitionModel,
-    state_of: Callable[[Any, int], int | None],
-    actions: list[Any],
-    mask: Bools | None,
-    steps: int,
-    seed: int,
-) -> str | None:
-    rng, time, starts = np.random.default_rng(seed), 0, model.initial
-    state: int | None = None
-    begun: dict[Any, list[float]] = {
-        (s, 0.0): [starts[s], 0] for s in np.flatnonzero(starts).tolist()
-    }
-    counts: Counts = {START: begun}
-    for taken, drawn in enumerate(rng.integers(len(actions), size=steps).tolist()):
-        if state is None:
-            observation, _ = env.reset(seed=seed if taken == 0 else None)
-            state, time = state_of(observation, 0), 0
-            if state is None or starts[state] == 0:
-                return NO_START.format(observation)
-        action = drawn
-        if mask is not None and rng.random() < LEGAL:
-            action = int(rng.choice(np.flatnonzero(mask[state])))
-        at = f"state {state}, action {action}"
-        if mask is not None and not mask[state, action]:
+        for taken, drawn in enumerate(rng.integers(len(actions), size=steps).tolist()):
+            if state is None:
+                seen, _ = env.reset(seed=None if taken else seed)
+                state, time = state_of(seen, 0), 0
+                if state is None or not _count(starts, [state], 0.0):
+                    return NO_START.format(seen)
+            action, is_legal = drawn, mask is None or mask[state, drawn]
+            if mask is not None and not is_legal and rng.random() < LEGAL:
+                action, is_legal = int(rng.choice(np.flatnonzero(mask[state]))), True
+            place = f"state {state}, action {action}"
             try:
-                env.step(actions[action])
-            except Exception:  # noqa: BLE001 (as the model says)
+                seen, reward, terminated, truncated, _ = env.step(actions[action])
+            except Exception:
+                if is_legal:
+                    raise
                 state = None
                 continue
-            return f"{at}: the environment allows it"
-        result, time = env.step(actions[action]), time + 1
-        following = None if result[2] else state_of(result[0], time)
-        if not _count(model, (state, action), following, result, counts):
-            made = "the end" if result[2] else "such a state" if following is None else following
-            step = f"step to {made} with the reward {float(result[1]):g}"
-            return f"{at}: the model has no {step}, the environment made one"
-        state = None if result[2] or result[3] else following
-    for _ in range(steps // STEPS_PER_START if len(begun) > 1 else 0):
-        observation, _ = env.reset()
-        if (first := (state_of(observation, 0), 0.0)) not in begun:
-            return NO_START.format(observation)
-        begun[first][1] += 1
-    return _unlikely(counts)
+            if not is_legal:
+                return f"{place}: the environment allows it"
+            time += 1
+            row = rows.get(place) or rows.setdefault(place, _row(model, state, action))
+            state = None if terminated else state_of(seen, time)
+            if not _count(row, [state, -1] if truncated else [-1 if terminated else state], reward):
+                made = "the end" if terminated else "such a state" if state is None else state
+                made = f"step to {made} with the reward {float(reward):g}"
+                return f"{place}: the model has no {made}, the environment made one"
+            state = None if truncated else state
+        for _ in range(steps // STEPS_PER_START if len(starts) > 1 else 0):
+            seen, _ = env.reset()
+            if not _count(starts, [state_of(seen, 0)], 0.0):
+                return NO_START.format(seen)
+    return _unlikely(rows)
 
 
-def _count(
-    model: TransitionModel, at: tuple[int, int], following: int | None, result: Any, counts: Counts
-) -> bool:
-    """Count the outcome of a step; False if the model does not have it."""
-    if at not in counts:
-        row = counts[at] = {}
-        for k in np.flatnonzero(model.prob[at] > 0):
-            target = -1 if model.terminated[at][k] else int(model.next_state[at][k])
-            noise = 0.0 if model.reward_variance is None else model.reward_variance[at][k]
-            key = target, None if noise > 0 else _rounded(model.reward[at][k])
-            row.setdefault(key, [0.0, 0.0])[0] += model.prob[at][k]
-    targets = ([] if following is None else [following]) + [-1] * bool(result[2] or result[3])
-    for key in [(t, reward) for t in targets for reward in (_rounded(result[1]), None)]:
-        if key in counts[at]:
-            counts[at][key][1] += 1
+def _row(model: TransitionModel, state: int, action: int) -> Row:
+    """What the model says of an action."""
+    at, row = (state, action), Row()
+    noise = 0 * model.prob[at] if model.reward_variance is None else model.reward_variance[at]
+    for k in np.flatnonzero(model.prob[at] > 0):
+        target = -1 if model.terminated[at][k] else int(model.next_state[at][k])
+        key = target, None if noise[k] > 0 else _rounded(model.reward[at][k])
+        row.setdefault(key, [0.0, 0.0])[0] += model.prob[at][k]
+    return row
+
+
+def _count(row: Row, targets: list[int | None], reward: Any) -> bool:
+    """Count an outcome, which leads to one of the targets; False if the row does not have it."""
+    for key in itertools.product(targets, (_rounded(reward), None)):
+        if key in row:
+            row[key][1] += 1
             return True
     return False
 
@@ -138,22 +129,24 @@ def _rounded(reward: Any) -> float:
     return float(f"{float(reward):.7g}")
 
 
-def _unlikely(counts: Counts) -> str | None:
+def _unlikely(rows: dict[str, Row]) -> str | None:
     """The frequency that the model makes too unlikely."""
-    together: dict[int, list[float]] = {}
-    for (state, action), row in counts.items():
+    together: dict[int, Any] = defaultdict(lambda: np.zeros(2))
+    for place, row in rows.items():
         n = sum(count for _, count in row.values())
         for rank, ((target, _), (p, count)) in enumerate(row.items()):
             off, variance = count - n * p, n * p * (1 - p)
-            if abs(off) > MOST_DEVIATIONS * math.sqrt(max(variance, FEWEST)):
-                to = "the end" if target < 0 else target
-                place = f"state {state}, action {action}: the step to {to}"
-                place = f"reset: the start in state {to}" if (state, action) == START else place
-                return f"{place} has a probability of {p:.3g}, it came {count:.0f} of {n:.0f} times"
-            total = together.setdefault(rank, [0.0, 0.0])
-            total[:] = total[0] + off, total[1] + variance
-    for off, variance in together.values():
-        if abs(off) > MOST_DEVIATIONS * math.sqrt(max(variance, FEWEST)):
-            deviations = f"{abs(off) / math.sqrt(variance):.1f} standard deviations"
-            return f"outcomes are {deviations} from their probabilities"
+            together[rank] += off, variance
+            if _deviations(off, variance) > MOST_DEVIATIONS:
+                what = "start in state" if place == "reset" else "step to"
+                what += f" {'the end' if target == -1 else target} has a probability of {p:.3g}"
+                return f"{place}: the {what}, it came {count:.0f} of {n:.0f} times"
+    for total in together.values():
+        if (far := _deviations(*total)) > MOST_DEVIATIONS:
+            return f"outcomes are {far:.1f} standard deviations from their probabilities"
     return None
+
+
+def _deviations(off: float, variance: float) -> float:
+    """How many standard deviations a count is off."""
+    return abs(off) / math.sqrt(max(variance, FEWEST))

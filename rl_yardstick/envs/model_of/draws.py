@@ -22,10 +22,11 @@ from rl_yardstick.envs.model_of.symbols import NORMAL, TAIL, UNIFORM, Drawn, Sto
 NEVER = 1 << 60  # a time that no episode reaches
 MOST = 20_000  # branches of one draw
 LEAST_CHANCE = 1e-13  # branches of a lower probability are cut off
+CUT_OFF = -1
 
 
 class Again(BaseException):
-    """A loop has come back to the draw after so many branches; -1: its chance is too low."""
+    """A loop has come back to the draw after so many branches; or `CUT_OFF`."""
 
 
 class Suspect(BaseException):
@@ -62,7 +63,7 @@ class Script:
         self.trace.append((choice, shares))
         self.chance *= shares[choice]
         if self.chance < LEAST_CHANCE and depth >= self.root:
-            raise Again(-1)
+            raise Again(CUT_OFF)
         return choice
 
     def visit(self) -> None:
@@ -143,14 +144,9 @@ class NumpyDraws:
     def _each(self, draw: Callable[..., Any], size: Any, *given: Any, dtype: Any = int) -> Any:
         """One draw, or an array of draws, with parameters that may be arrays."""
         self._script.visit()
-        if size is None and not any(map(np.ndim, given)):
-            value = draw(*given)
-            return np.int64(value) if dtype is int else value
-        shape = np.broadcast_shapes(*map(np.shape, given)) if size is None else np.empty(size).shape
-        flat = [np.broadcast_to(x, shape).ravel().tolist() for x in given]
-        drawn = np.empty(math.prod(shape), object)
-        drawn[:] = [draw(*parameters) for parameters in zip(*flat, strict=True)]
-        return drawn.reshape(shape).astype(dtype)[()]
+        shaped = np.zeros(() if size is None else size)
+        drawn = np.frompyfunc(lambda _, *given: draw(*given), 1 + len(given), 1)(shaped, *given)
+        return np.asarray(drawn, dtype)[()]
 
     def integers(
         self, low: Any, high: Any = None, size: Any = None, dtype: Any = int, endpoint: bool = False
@@ -184,8 +180,7 @@ class NumpyDraws:
         pool = np.arange(a) if isinstance(a, int | np.integer) else np.asarray(a)
         weights = None if p is None else [float(x) for x in p]
         if replace or size is None:
-            draw = self._script.branch
-            return pool[self._each(lambda _: draw(weights or len(pool)), size, 0)]
+            return pool[self._each(lambda: self._script.branch(weights or len(pool)), size)]
         indices = self._in_order(int(np.prod(size)), len(pool), weights)
         return pool[indices].reshape(np.empty(size).shape + pool.shape[1:])
 

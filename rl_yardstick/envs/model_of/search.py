@@ -9,6 +9,7 @@ shared out among the other outcomes, which is exact.
 from __future__ import annotations
 
 import copy
+import itertools
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rl_yardstick.envs.model_of.draws import NEVER, Again, Script, Suspect, take_step
+from rl_yardstick.envs.model_of.draws import CUT_OFF, NEVER, Again, Script, Suspect, take_step
 from rl_yardstick.envs.model_of.states import Refuted, Saved, State
 from rl_yardstick.envs.model_of.symbols import Drawn, Limit, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
@@ -53,16 +54,16 @@ class Tree:
         """The probability of each outcome."""
         while True:
             try:
-                chances, returned = self._below([], 0, [])
+                chances = self._below([], 0, [])
             except Suspect as suspect:
                 self._judge(*suspect.args)
             else:
-                rest = 1 - returned.get(-1, 0.0)
+                rest = 1 - chances.pop(CUT_OFF, 0.0)
                 return {outcome: p / rest for outcome, p in chances.items()}
 
     def _below(
         self, choices: list[int], root: int, back: list[list[int]], leaf: Any = None
-    ) -> tuple[Chances, Chances]:
+    ) -> Chances:
         """The chances of the outcomes below these choices, and of coming back to each node above.
 
         ``back`` collects the runs that came back; ``leaf`` is a run that began with the choices:
@@ -70,49 +71,47 @@ class Tree:
         """
         if leaf is None:
             try:
-                leaf = self.run(choices, root, self.loops), -1, self.script.trace
+                outcome: Any = self.run(choices, root, self.loops)
             except Again as again:
-                leaf = None, again.args[0], self.script.trace
-        outcome, node, trace = leaf
+                outcome = again.args[0]
+            leaf = outcome, self.script.trace
+        outcome, trace = leaf
         depth = len(choices)
         if len(trace) == depth:
-            if outcome is not None:
-                return {outcome: 1.0}, {}
-            back += [choices] if node >= 0 else []
-            return {}, {node: 1.0}
+            if isinstance(outcome, int) and outcome != CUT_OFF:
+                back.append(choices)
+            return {outcome: 1.0}
         chosen, shares = trace[depth]
-        total: Chances = {}
-        returned: Chances = {}
+        total: Chances = defaultdict(float)
         for choice, p in enumerate(shares):
             if p > 0:
                 known = leaf if choice == chosen else None
-                below = self._below([*choices, choice], root, back, known)
-                for whole, part in zip((total, returned), below, strict=True):
-                    for key, share in part.items():
-                        whole[key] = whole.get(key, 0.0) + p * share
-        mine = returned.pop(depth, 0.0)
-        if mine > 1 - 1e-12:
+                for key, share in self._below([*choices, choice], root, back, known).items():
+                    total[key] += p * share
+        returned = total.pop(depth, 0.0)
+        if returned > 1 - 1e-12:
             raise Stop("a loop draws again and again, and never ends")
-        if mine:
-            total, returned = ({k: p / (1 - mine) for k, p in x.items()} for x in (total, returned))
-        return total, returned
+        return {key: p / (1 - returned) for key, p in total.items()} if returned else total
 
     def _judge(self, place: Any, first: int, choices: list[int]) -> None:
         """Whether a second visit starts again from the first: then the same must follow both."""
         self.loops[place] = True
         back: list[list[int]] = []
         try:
-            one, _ = self._below(choices[:first], first, back)
-            others = [self._below(path, len(path), [])[0] for path in back[:3]]
+            one = self._below(choices[:first], first, back)
+            others = [self._below(path, len(path), []) for path in back[:3]]
         except Stop:
             self.loops[place] = False
         except Suspect as inner:  # is judged first
             del self.loops[place]
             self._judge(*inner.args)
         else:
-            same = all(one.keys() == other.keys() for other in others)
-            same = same and all(abs(p - x[key]) < 1e-9 for x in others for key, p in one.items())
-            self.loops[place] = same and bool(one)
+            outcomes = {*one}.union(*others) - {CUT_OFF}
+            self.loops[place] = bool(outcomes) and all(
+                abs(one.get(key, 0.0) - other.get(key, 0.0)) < 1e-9
+                for other in others
+                for key in outcomes
+            )
 
 
 @dataclass
@@ -172,7 +171,7 @@ class Search:
             observation, _ = self.state.layers[0].reset(seed=seed)
             self.put(True)
             chances[Outcome(self._number(observation, is_reset=True), 0.0)] += 1 / len(self.seeds)
-        return dict(chances)
+        return chances
 
     def refuse_start(self, variables: Saved) -> None:
         """Name the attribute that no start of an episode has."""
@@ -227,8 +226,7 @@ class Search:
         state = self.state
         state.restore(saved)
         observation, reward, terminated, truncated = take_step(state.layers[0], action)
-        if isinstance(reward, np.ndarray):
-            reward = reward.item()
+        reward = reward.item() if isinstance(reward, np.ndarray) else reward
         moments = reward.moments() if isinstance(reward, Drawn) else (float(reward), 0.0)
         if terminated or truncated:
             state.variables()
@@ -318,25 +316,18 @@ class Search:
 
     def _model(self) -> tuple[TransitionModel, Bools]:
         """The model, whose state at time t has the number t * states + state, and its mask."""
-        entries = [
-            (first, s, a, k, p, o.reward, o.variance, o.state < 0, max(o.state, 0))
-            for s, row in enumerate(self.rows)
-            for a, spans in enumerate(row)
-            for first, chances in spans
-            for k, (o, p) in enumerate(chances.items())
-        ]
-        columns = np.array(entries, float).T
-        first, s, a, k = columns[:4].astype(np.int64)
         n, self.times = len(self.rows), self._count_times()
-        shape = self.times, n, len(self.actions), int(k.max()) + 1
+        most = max(len(chances) for row in self.rows for spans in row for _, chances in spans)
+        shape = self.times, n, len(self.actions), most
         if 5 * np.prod(shape, dtype=float) > MOST_ENTRIES:
             raise Limit(f"a model of {n:,} states at {self.times:,} times is too large")
         table = np.zeros((5, *shape))  # probability, reward, variance, end, next state
         table[0, ..., 0] = table[3] = 1.0  # of actions that are not allowed
-        for time in range(self.times):
-            at = first == time
-            table[:, time:, s[at], a[at]] = 0.0
-            table[:, time:, s[at], a[at], k[at]] = columns[4:, None, at]
+        for (s, row), a in itertools.product(enumerate(self.rows), range(len(self.actions))):
+            for first, chances in row[a]:
+                parts = [(p, *o[1:3], o.state < 0, max(o.state, 0)) for o, p in chances.items()]
+                table[:, first:, s, a] = 0.0
+                table[:, first:, s, a, : len(parts)] = np.array(parts).T[:, None]
         table[0] /= table[0].sum(axis=3, keepdims=True)
         table[4] += n * np.minimum(np.arange(self.times) + 1, self.times - 1)[:, None, None, None]
         prob, reward, variance, ends, following = table.reshape(5, self.times * n, *shape[2:])

@@ -247,11 +247,7 @@ class State:
     def key(self, variables: Saved) -> Hashable:
         """The state by value."""
         flat = [pair for own in variables for pair in own.items()]
-        rest = [value for _, value in flat if not isinstance(value, SIMPLE)]
-        if not rest:
-            return tuple(flat)
-        simple = [pair if isinstance(pair[1], SIMPLE) else pair[0] for pair in flat]
-        return tuple(simple), self.by_value(rest if len(rest) > 1 else rest[0])
+        return tuple(flat) if all(isinstance(x, SIMPLE) for _, x in flat) else self.by_value(flat)
 
     def save(self, variables: Saved) -> bytes:
         """A state to restore, in which constants are the objects that they were."""
@@ -296,8 +292,6 @@ class State:
         """Something hashable that is equal for equal values."""
         if isinstance(value, SIMPLE):
             return value
-        if type(value) is np.ndarray and value.dtype != object:
-            return value.dtype.char, value.shape, value.tobytes()
         file = io.BytesIO()
         ByValue(file, self).dump(value)
         return file.getvalue()
