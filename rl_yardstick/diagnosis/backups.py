@@ -137,8 +137,10 @@ def name_of_rule(rule: str, right: str) -> str:
     """The fault of a learner whose next value is by this rule."""
     if rule not in ("largest", "next", "expected"):
         return f"next-value-is-{rule}"
-    ways = ("maximises", "follows") if rule == "largest" else ("follows", "maximises")
-    return f"{ways[0]}-instead-of-{ways[1]} ({rule})"
+    if rule == "largest":
+        return f"maximises-instead-of-follows ({rule})"
+    # from outside, an action chosen by the policy or by another state's values looks the same
+    return f"follows-instead-of-maximises or next-value-is-best-in-own-state ({rule})"
 
 
 # --- the values to which a formula leads ----------------------------------------------------------

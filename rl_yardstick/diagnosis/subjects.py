@@ -42,6 +42,9 @@ _KIND_WORDS = {
 }
 
 
+_LONGER = r"monte[ _-]?carlo|lambda|trace|n[ _-]?step"  # words of learners that look far ahead
+
+
 def kind_of(*texts: str | None) -> str | None:
     """The kind that a name or a docstring tells first."""
     for text in texts:
@@ -69,8 +72,10 @@ class Subject(ABC):
     observes: SpaceKind  # the kind of observations
     kinds: Sequence[SpaceKind] = ("box", "discrete")  # that are tried, in this order
 
-    def __init__(self, name: str, kind: str | None) -> None:
+    def __init__(self, name: str, kind: str | None, doc: str = "") -> None:
         self.name, self.kind = name, kind
+        #: whether each step learns from the next value alone
+        self.is_one_step = not re.search(_LONGER, f"{name} {kind} {doc}", re.I)
 
     @abstractmethod
     def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
@@ -172,14 +177,15 @@ class ClassSubject(Subject):
         kind: str | None = None,
         wanted: SpaceKind | None = None,
     ) -> None:
-        super().__init__(name, kind)
+        cls: Any = load_algorithm(name)
+        plain = getattr(cls, "plain", None)
+        doc = inspect.getdoc(plain or cls) or ""
+        super().__init__(name, kind, doc)
         if ALGORITHMS[name].for_bandits:
             raise UserError(f"--algo {name}: it is for bandits, and this world has states")
         if ALGORITHMS[name].family in ("planning", "reference"):
             raise UserError(f"--algo {name}: it does not learn")
-        self.cls: Any = load_algorithm(name)
-        self.parameters = constructor_parameters(self.cls)
-        plain = getattr(self.cls, "plain", None)
+        self.cls, self.parameters = cls, constructor_parameters(cls)
         if plain is not None and "gamma" not in self.parameters:
             raise UserError(f"--algo {name}: its constructor must take gamma, which is set to 0.8")
         known = arguments_of(name)
@@ -189,7 +195,7 @@ class ClassSubject(Subject):
         ancestors = [ancestor.__name__ for ancestor in self.cls.__mro__]
         family = next((each for each in ancestors if each in _FAMILIES), "")
         claims, settings = _FAMILIES.get(family, (None, {}))
-        told = kind_of(name.rpartition(".")[2], inspect.getdoc(plain or self.cls))
+        told = kind_of(name.rpartition(".")[2], doc)
         self.kind, self.base = kind or claims or told, {**_EXPLORES, **settings}
         if plain is None:
             self.kinds = ("discrete", "box")
@@ -244,8 +250,8 @@ class ScriptSubject(Subject):
         wanted: SpaceKind | None = None,
     ) -> None:
         module: Any = inspect.getmodule(function)
-        told = kind_of(name, inspect.getdoc(function), getattr(module, "__doc__", None))
-        super().__init__(name, kind or told)
+        docs = inspect.getdoc(function) or "", getattr(module, "__doc__", None) or ""
+        super().__init__(name, kind or kind_of(name, *docs), " ".join(docs))
         self.function, self.typed = function, typed
         try:
             self.parameters = inspect.signature(function).parameters
