@@ -20,9 +20,9 @@ from rl_yardstick.diagnosis.backups import (
     measured,
 )
 from rl_yardstick.diagnosis.composite_world import BETTER, END, GAMMA, N_STATES, STORIES, Steps
-from rl_yardstick.diagnosis.subjects import KINDS, Subject
+from rl_yardstick.diagnosis.subjects import KINDS, CannotTrain, Subject
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import UserError
 
 State = Literal["right", "wrong", "unreadable"]
 
@@ -81,11 +81,8 @@ def audit(subject: Subject, seeds: int = 0) -> Verdict:
         told, (fault, note) = found[0], found[1] or ("", "")
         state: State = "wrong" if note else "right"
         return Verdict(subject.name, state, fault, told.words(), (note,) * bool(note), "", told)
-    except UserError:
-        raise
-    except Exception as error:  # noqa: BLE001 (user code may raise anything)
-        why = f"it cannot train here: {type(error).__name__}: {one_line(error)}"
-        return Verdict(subject.name, "unreadable", notes=(why,))
+    except CannotTrain as error:
+        return Verdict(subject.name, "unreadable", notes=(f"it cannot train here: {error}",))
 
 
 # --- by values after training ---------------------------------------------------------------------
@@ -198,7 +195,8 @@ class _ByValues:
                 return verdict("wrong", other_fault[0], notes=(other_fault[1],))
             unseen = UNSEEN_OF_ACTORS if rule == "states" else UNSEEN
             return verdict("right", unseen="" if self.is_table else unseen)
-        is_tight = near[0].rms <= (0.25 if self.is_table else 0.5) and near[0].worst <= 1
+        tight = 0.25 if self.is_table else 0.5
+        is_tight = near[0].rms <= tight and near[0].worst <= 4 * tight
         fault = fault_of(near[0].name)
         other = next(each for each in near if fault_of(each.name) != fault)
         told = [f"{fault_of(each.name)} at {each.rms:.2f}" for each in (near[0], other)]
@@ -206,8 +204,7 @@ class _ByValues:
         if fault == RIGHT and not any(backup.off()):  # it is too noisy, or learns too slowly
             return verdict("unreadable", notes=(note,))
         is_named = is_tight and other.rms > 1.9 * near[0].rms and fault != RIGHT
-        if fault.startswith(OF_ONE_STEP) and not self.subject.is_one_step:
-            is_named = False
+        is_named &= self.subject.is_one_step or not fault.startswith(OF_ONE_STEP)
         return verdict("wrong", fault if is_named else "", notes=(note,))
 
     def _other_fault(self, trainings: Sequence[_Training]) -> tuple[str, str] | None:

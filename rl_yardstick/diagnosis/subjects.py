@@ -54,13 +54,26 @@ def kind_of(*texts: str | None) -> str | None:
     return None
 
 
+class CannotTrain(Exception):  # noqa: N818 (a finding)
+    """What the audited program raised, in a line."""
+
+
+def by_user(function: Callable[..., Any], *args: Any, **settings: Any) -> Any:
+    """What a function of the audited program returns; `CannotTrain` if it raises anything."""
+    try:
+        return function(*args, **settings)
+    except UserError:
+        raise
+    except Exception as error:
+        raise CannotTrain(f"{type(error).__name__}: {one_line(error)}") from error
+
+
 class Trained(NamedTuple):
     """What a training in the composite world leaves."""
 
     values: Floats | None  #: of actions (S, 2) or of states (S, 1); None if they cannot be read
     act: Callable[[int], int]  #: the action in a state when evaluated
     logs: list[list[Row]]  #: of each copy of the world
-    model: Any
 
 
 class Subject(ABC):
@@ -91,15 +104,15 @@ class Subject(ABC):
             **changes: settings under the learner's names.
         """
         copies = Copies(self.observes == "discrete", bump)
-        model = self.run(copies, seed, steps, changes)
+        model = by_user(self.run, copies, seed, steps, changes)
         world = copies()
         shown = [world.observation_of(state) for state in range(N_STATES)]
 
         def act(state: int) -> int:
-            action = model.predict(np.asarray(shown[state]), deterministic=True)[0]
+            action, _ = by_user(model.predict, np.asarray(shown[state]), deterministic=True)
             return int(np.asarray(action).reshape(-1)[0])
 
-        return Trained(values_of(model, shown), act, copies.of_training(), model)
+        return Trained(by_user(values_of, model, shown), act, copies.of_training())
 
     def named(self, *names: str) -> str | None:
         """The first of these settings that the learner has."""
@@ -113,10 +126,8 @@ class Subject(ABC):
             try:
                 self.train(60, 0).act(0)
                 return
-            except UserError:
-                raise
-            except Exception as error:  # noqa: BLE001 (user code may raise anything)
-                errors.append(f"{type(error).__name__}: {one_line(error)}")
+            except CannotTrain as error:
+                errors.append(str(error))
         raise UserError(
             f"{self.name} cannot train on a tiny world: {'; '.join(dict.fromkeys(errors))} "
             "(--observations sets their kind)"
