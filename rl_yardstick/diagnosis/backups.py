@@ -133,12 +133,14 @@ def fault_of(name: str) -> str:
     return name.partition(" (")[0]
 
 
-def name_of_rule(rule: str, right: str) -> str:
+def name_of_rule(rule: str) -> str:
     """The fault of a learner whose next value is by this rule."""
     if rule not in ("largest", "next", "expected"):
         return f"next-value-is-{rule}"
-    ways = ("maximises", "follows") if rule == "largest" else ("follows", "maximises")
-    return f"{ways[0]}-instead-of-{ways[1]} ({rule})"
+    if rule == "largest":
+        return f"maximises-instead-of-follows ({rule})"
+    # from outside, an action chosen by the policy or by another state's values looks the same
+    return f"follows-instead-of-maximises or next-value-is-best-in-own-state ({rule})"
 
 
 # --- the values to which a formula leads ----------------------------------------------------------
@@ -224,7 +226,7 @@ def _of_actions(d: Steps, rule: str, own: Floats, first: Floats) -> Iterator[Can
     for wrong in RULES:
         is_same = {wrong, rule} <= {"next", "expected"} or wrong == rule
         if not (is_same or (wrong == "mean" and rule != "largest" and d.exploration[-1] > 0.8)):
-            yield solve(name_of_rule(wrong, rule), right, d, wrong, own)
+            yield solve(name_of_rule(wrong), right, d, wrong, own)
     other = copy.copy(d)
     for tag, other.action in (("before", d.action_before), ("after", d.next_action)):
         yield solve(f"action-of-another-step ({tag})", right, other, rule, own)

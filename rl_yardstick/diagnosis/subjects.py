@@ -42,6 +42,9 @@ _KIND_WORDS = {
 }
 
 
+_LONGER = r"monte[ _-]?carlo|lambda|trace|n[ _-]?step"  # words of learners that look far ahead
+
+
 def kind_of(*texts: str | None) -> str | None:
     """The kind that a name or a docstring tells first."""
     for text in texts:
@@ -51,13 +54,26 @@ def kind_of(*texts: str | None) -> str | None:
     return None
 
 
+class CannotTrain(Exception):  # noqa: N818 (a finding)
+    """What the audited program raised, in a line."""
+
+
+def by_user(function: Callable[..., Any], *args: Any, **settings: Any) -> Any:
+    """What a function of the audited program returns; `CannotTrain` if it raises anything."""
+    try:
+        return function(*args, **settings)
+    except UserError:
+        raise
+    except Exception as error:
+        raise CannotTrain(f"{type(error).__name__}: {one_line(error)}") from error
+
+
 class Trained(NamedTuple):
     """What a training in the composite world leaves."""
 
     values: Floats | None  #: of actions (S, 2) or of states (S, 1); None if they cannot be read
     act: Callable[[int], int]  #: the action in a state when evaluated
     logs: list[list[Row]]  #: of each copy of the world
-    model: Any
 
 
 class Subject(ABC):
@@ -69,8 +85,10 @@ class Subject(ABC):
     observes: SpaceKind  # the kind of observations
     kinds: Sequence[SpaceKind] = ("box", "discrete")  # that are tried, in this order
 
-    def __init__(self, name: str, kind: str | None) -> None:
+    def __init__(self, name: str, kind: str | None, doc: str = "") -> None:
         self.name, self.kind = name, kind
+        #: whether each step learns from the next value alone
+        self.is_one_step = not re.search(_LONGER, f"{name} {kind} {doc}", re.I)
 
     @abstractmethod
     def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
@@ -86,15 +104,15 @@ class Subject(ABC):
             **changes: settings under the learner's names.
         """
         copies = Copies(self.observes == "discrete", bump)
-        model = self.run(copies, seed, steps, changes)
+        model = by_user(self.run, copies, seed, steps, changes)
         world = copies()
         shown = [world.observation_of(state) for state in range(N_STATES)]
 
         def act(state: int) -> int:
-            action = model.predict(np.asarray(shown[state]), deterministic=True)[0]
+            action, _ = by_user(model.predict, np.asarray(shown[state]), deterministic=True)
             return int(np.asarray(action).reshape(-1)[0])
 
-        return Trained(values_of(model, shown), act, copies.of_training(), model)
+        return Trained(by_user(values_of, model, shown), act, copies.of_training())
 
     def named(self, *names: str) -> str | None:
         """The first of these settings that the learner has."""
@@ -108,10 +126,8 @@ class Subject(ABC):
             try:
                 self.train(60, 0).act(0)
                 return
-            except UserError:
-                raise
-            except Exception as error:  # noqa: BLE001 (user code may raise anything)
-                errors.append(f"{type(error).__name__}: {one_line(error)}")
+            except CannotTrain as error:
+                errors.append(str(error))
         raise UserError(
             f"{self.name} cannot train on a tiny world: {'; '.join(dict.fromkeys(errors))} "
             "(--observations sets their kind)"
@@ -172,14 +188,15 @@ class ClassSubject(Subject):
         kind: str | None = None,
         wanted: SpaceKind | None = None,
     ) -> None:
-        super().__init__(name, kind)
+        cls: Any = load_algorithm(name)
+        plain = getattr(cls, "plain", None)
+        doc = inspect.getdoc(plain or cls) or ""
+        super().__init__(name, kind, doc)
         if ALGORITHMS[name].for_bandits:
             raise UserError(f"--algo {name}: it is for bandits, and this world has states")
         if ALGORITHMS[name].family in ("planning", "reference"):
             raise UserError(f"--algo {name}: it does not learn")
-        self.cls: Any = load_algorithm(name)
-        self.parameters = constructor_parameters(self.cls)
-        plain = getattr(self.cls, "plain", None)
+        self.cls, self.parameters = cls, constructor_parameters(cls)
         if plain is not None and "gamma" not in self.parameters:
             raise UserError(f"--algo {name}: its constructor must take gamma, which is set to 0.8")
         known = arguments_of(name)
@@ -189,7 +206,7 @@ class ClassSubject(Subject):
         ancestors = [ancestor.__name__ for ancestor in self.cls.__mro__]
         family = next((each for each in ancestors if each in _FAMILIES), "")
         claims, settings = _FAMILIES.get(family, (None, {}))
-        told = kind_of(name.rpartition(".")[2], inspect.getdoc(plain or self.cls))
+        told = kind_of(name.rpartition(".")[2], doc)
         self.kind, self.base = kind or claims or told, {**_EXPLORES, **settings}
         if plain is None:
             self.kinds = ("discrete", "box")
@@ -244,8 +261,8 @@ class ScriptSubject(Subject):
         wanted: SpaceKind | None = None,
     ) -> None:
         module: Any = inspect.getmodule(function)
-        told = kind_of(name, inspect.getdoc(function), getattr(module, "__doc__", None))
-        super().__init__(name, kind or told)
+        docs = inspect.getdoc(function) or "", getattr(module, "__doc__", None) or ""
+        super().__init__(name, kind or kind_of(name, *docs), " ".join(docs))
         self.function, self.typed = function, typed
         try:
             self.parameters = inspect.signature(function).parameters

@@ -411,7 +411,7 @@ FAULTS = [
     ),
     (
         "script_ppo",
-        "advantage-sign",
+        "advantage-sign or ratio-inverted",
         "adv = th.as_tensor(advantages)",
         "adv = -th.as_tensor(advantages)",
     ),

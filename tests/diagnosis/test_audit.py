@@ -72,3 +72,28 @@ def test_what_cannot_be_read_says_which_method_to_add(verdict_on):
     found = verdict_on("table", method)
     assert (found.state, found.exit_code) == ("unreadable", 2)
     assert "add the method values(obs)" in found.lines()[-1]
+
+
+def test_a_short_rollout_that_ends_like_an_episode_is_seen(verdict_on):
+    counted = "age = 1 if step == 0 or ended else age + 1\n        ended = done\n        "
+    counted += "value = 0.0 if terminated or age == 5 else"
+    found = verdict_on("table", "value = 0.0 if terminated else", counted, "_rollout")
+    assert (found.state, found.fault) == ("wrong", "")
+
+
+def test_the_best_action_of_the_own_state_is_not_called_another_fault(verdict_on):
+    old, new = "q[following].max()", "q[following, q[obs].argmax()]"
+    found = verdict_on("table", old, new, "_own_best")
+    assert found.state == "wrong"
+    assert not found.fault or "next-value-is-best-in-own-state" in found.fault
+
+
+def test_what_training_raises_is_told_and_what_the_audit_raises_is_not_caught(
+    verdict_on, monkeypatch
+):
+    found = verdict_on("table", "epsilon = 0.5", "epsilon = 0.5 if step < 99 else 1 // 0", "_fails")
+    assert (found.state, found.exit_code) == ("unreadable", 2)
+    assert "it cannot train here: ZeroDivisionError" in found.lines()[-1]
+    monkeypatch.setattr("rl_yardstick.diagnosis.audit.nearest", lambda *_: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        verdict_on("table", tag="_own_error")
