@@ -38,11 +38,11 @@ def main() -> int:
     from rl_yardstick.pipeline.settings import parse_assignments
 
     kwargs = {**parse_assignments(args.env_kwargs, "--env-kwargs"), "disable_env_checker": True}
-    signal.signal(signal.SIGALRM, lambda *_: sys.exit(LATE))
-    signal.alarm(max(17 - int(time.monotonic() - begin), 5))  # seconds; a call may hang
-    try:
-        found = examine(lambda: make_env(args.env, kwargs))
-    finally:
+    if sys.platform != "win32":
+        signal.signal(signal.SIGALRM, lambda *_: sys.exit(LATE))
+        signal.alarm(max(17 - int(time.monotonic() - begin), 5))  # seconds; a call may hang
+    found = examine(lambda: make_env(args.env, kwargs))
+    if sys.platform != "win32":
         signal.alarm(0)
     console, seconds = table_console(), time.monotonic() - begin
     for one in found:

@@ -505,7 +505,7 @@ FAULTS = [
 ]
 
 
-def text_of(program, old="", new=""):
+def text_of(program: str, old: str = "", new: str = "") -> str:
     """The text of a program with one replacement, which must find its place."""
     text, _ = PROGRAMS[program]
     assert not old or text.count(old) == 1, (program, old)
