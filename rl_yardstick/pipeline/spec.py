@@ -61,9 +61,7 @@ class TrainSpec(BaseModel):
     vec_env: Literal["dummy", "subproc"] = "dummy"
     device: str = "auto"  #: torch device of networks
     n_threads: int = 1  #: of PyTorch, which may change bits; below 1: PyTorch's choice
-    exact_model: str = Field(
-        default="auto", pattern="^(auto|none|[1-9][0-9]*)$"
-    )  #: searched
+    exact_model: str = Field(default="auto", pattern="^(auto|none|[1-9][0-9]*)$")  #: searched
     pictures: bool = True  #: draw into the run folder
     diagnose: bool = False  #: compare values and gradients with exact ones at evaluations
     watch_learning: str | None = None  #: file of a page that plays the training
