@@ -21,7 +21,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from rl_yardstick.envs import ENVIRONMENTS, register_environments
+from rl_yardstick.envs import ENVIRONMENTS, found_models, register_environments
 from rl_yardstick.envs.known_models import observations_of_states, transition_model
 from rl_yardstick.envs.model_of import FoundModel, NotFinite, model_of
 from rl_yardstick.envs.model_of.check import refutation
@@ -107,6 +107,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=Path("any-model.json"))
     parser.add_argument("--seconds", type=float, default=100.0)
     given = parser.parse_args()
+    found_models.limit("none")  # so that `transition_model` gives what is published
     rows = [HEADING, ["---"] * len(HEADING)]
     for name, make in makers().items():
         if not given.names or name in given.names:
