@@ -75,7 +75,8 @@ def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> Optimum:
 
     world = world_of(env_id, with_files_read(env_id, {"env_kwargs": {**kwargs}})["env_kwargs"])
     model, horizon = known.transition_model(world.env), known.time_limit(world.env)
-    search, masks = known.found_claim(world.env), known.action_masks_of_states(world.env)
+    search = known.found_claim(world.env)
+    masks = known.action_masks_of_states(world.env) if search is None else search.mask
     if model is None or horizon is None:
         check = known.model_check(world.env)
         reason = "" if check is None else f": {check.refusal}"

@@ -120,8 +120,8 @@ def _model(spec: TrainSpec, env: gym.Env[Any, Any]) -> TransitionModel:
     if (model := transition_model(env)) is not None:
         return model
     check = model_check(env)
-    reason = None if check is None else check.refusal
-    raise UserError(reason or f"the model of {spec.env_id} is not known, so there is no optimum")
+    reason = "so there is no optimum" if check is None else check.refusal
+    raise UserError(f"the model of {spec.env_id} is not known: {reason}")
 
 
 # --- results --------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from rl_yardstick.envs.finite_spaces import Bijection
 from rl_yardstick.envs.model_of import FoundModel, NotFinite, Unfinished, model_of
 from rl_yardstick.envs.model_of.check import seeded_globally
-from rl_yardstick.envs.published_models import copy_of
+from rl_yardstick.envs.published_models import copy_of, is_changed
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 Env = gym.Env[Any, Any]
@@ -111,6 +111,8 @@ def found(core: Env) -> FoundClaim | NotFound | None:
 
 def _by_name(core: Env, limits: Limits) -> FoundClaim | NotFound:
     """The result of an earlier search in the same code, or of a new one."""
+    if is_changed(core.unwrapped):  # a method of the copy may act on the original
+        return NotFound("a method was replaced by hand")
     try:
         twin = copy_of(core)
         name = None if core.spec is None else _name_of(twin, limits)

@@ -38,6 +38,7 @@ from rl_yardstick.envs.wrappers import (
     OneHotObservation,
     ScaleReward,
     TerminationReward,
+    mask_source,
 )
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
@@ -167,7 +168,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
     if idle:
         return np.array(idle[-1])
     if isinstance(claim := _judged(core)[0], FoundClaim):
-        return claim.mask
+        return claim.mask if mask_source(env) is None else None
     # A subclass may have masks of its own.
     base: Any = core
     kind: Any = type(core)

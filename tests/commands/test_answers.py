@@ -92,7 +92,6 @@ def test_mistakes_are_one_line(line, said, type_command, tmp_path, request):
 
 def test_no_line_in_a_pipe_is_too_wide(type_command, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr("rl_yardstick.envs.checking.N_STEPS", 600)  # of 60,000, most of its time
     for words in [*(f"{command} --help" for command in COMMANDS), *TABLE["right"]]:
         code, out, err = type_command("yardstick", *words.split())
         assert code in (0, 1), err

@@ -60,8 +60,7 @@ class LateFee(gym.Wrapper):
         return obs, reward - 10 * truncated, terminated, truncated, info
 
 
-gym.register("Walk-v0", entry_point=Walk, max_episode_steps=30)
-gym.register("Endless-v0", entry_point=Walk)
+gym.register("Paces-v0", entry_point=Walk, max_episode_steps=30)
 
 
 def by_hand(n=5, slip=0.25, steps=30, fee=0.0):
@@ -74,17 +73,17 @@ def by_hand(n=5, slip=0.25, steps=30, fee=0.0):
 
 
 WORLDS = {
-    "a time limit around": (lambda: gym.make("Walk-v0"), by_hand()),
+    "a time limit around": (lambda: gym.make("Paces-v0"), by_hand()),
     "its own time": (lambda: Walk(limit=4), by_hand(steps=4)),
-    "the shorter of both": (lambda: gym.make("Walk-v0", limit=4), by_hand(steps=4)),
-    "a known wrapper": (lambda: gym.wrappers.ClipReward(gym.make("Walk-v0"), -0.5, 1),
+    "the shorter of both": (lambda: gym.make("Paces-v0", limit=4), by_hand(steps=4)),
+    "a known wrapper": (lambda: gym.wrappers.ClipReward(gym.make("Paces-v0"), -0.5, 1),
         by_hand() / 2),
-    "an unknown wrapper": (lambda: Doubled(gym.make("Walk-v0")), 2 * by_hand()),
+    "an unknown wrapper": (lambda: Doubled(gym.make("Paces-v0")), 2 * by_hand()),
     "a wrapper that sees the end of time": (
-        lambda: LateFee(gym.make("Walk-v0", max_episode_steps=4)), by_hand(steps=4, fee=-10.0)),
+        lambda: LateFee(gym.make("Paces-v0", max_episode_steps=4)), by_hand(steps=4, fee=-10.0)),
     "an unknown wrapper of a published model": (lambda: Doubled(gym.make("FrozenLake-v1")),
         2 * 0.7441903),
-    "an action that raises": (lambda: gym.make("Walk-v0", walls=True), by_hand()),
+    "an action that raises": (lambda: gym.make("Paces-v0", walls=True), by_hand()),
 }  # fmt: skip
 
 
@@ -97,7 +96,7 @@ def test_the_optimum_is_that_of_the_environment_in_its_wrappers(name):
 
 
 def test_an_action_that_raises_is_masked_and_never_better():
-    env = gym.make("Walk-v0", walls=True)
+    env = gym.make("Paces-v0", walls=True)
     model, masks = known.transition_model(env), known.action_masks_of_states(env)
     assert masks.sum() == masks.size - 1
     stays = policy_return(model, np.zeros(model.n_states, np.int64), 30)
@@ -122,17 +121,17 @@ def forget():
 
 def test_a_search_is_kept_for_the_same_code_and_arguments(monkeypatch, tmp_path):
     searches = counted(monkeypatch)
-    first = ys.optimum("Walk-v0")
+    first = ys.optimum("Paces-v0")
     forget()
-    assert ys.optimum("Walk-v0")["optimum"] == first["optimum"]
+    assert ys.optimum("Paces-v0")["optimum"] == first["optimum"]
     assert len(searches) == 1
     forget()
-    assert ys.optimum("Walk-v0", slip=0.5)["optimum"] == pytest.approx(by_hand(slip=0.5))
+    assert ys.optimum("Paces-v0", slip=0.5)["optimum"] == pytest.approx(by_hand(slip=0.5))
     assert len(searches) == 2
     for file in (tmp_path / "yardstick" / "models").iterdir():
         file.write_bytes(b"broken")
     forget()
-    assert ys.optimum("Walk-v0")["optimum"] == first["optimum"]
+    assert ys.optimum("Paces-v0")["optimum"] == first["optimum"]
     assert len(searches) == 3
 
 
@@ -155,25 +154,25 @@ def test_other_code_of_the_same_name_is_searched_anew(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("none", "the model of Walk-v0 is not known$"),
+        ("none", "the model of Paces-v0 is not known$"),
         ("3", "more than 3 states.*; --model 30 to continue$"),
     ],
 )
 def test_limits(kind, words):
     found_models.limit(kind)
     with pytest.raises(ys.UserError, match=words):
-        ys.optimum("Walk-v0")
+        ys.optimum("Paces-v0")
 
 
 def test_a_run_is_judged_exactly():
     settings = {"n_timesteps": 64, "n_steps": 32, "batch_size": 32, "seed": 0, "folder": None}
-    run = ys.train("Walk-v0", "ppo", **settings)
+    run = ys.train("Paces-v0", "ppo", **settings)
     assert run.result["optimum"] == pytest.approx(by_hand())
-    assert "optimum" not in ys.train("Walk-v0", "ppo", model="none", **settings).result
+    assert "optimum" not in ys.train("Paces-v0", "ppo", model="none", **settings).result
 
 
 def test_an_environment_is_left_as_it_was():
-    env = gym.make("Walk-v0")
+    env = gym.make("Paces-v0")
     env.reset(seed=3)
     env.step(1)
     before = env.unwrapped.cell, env.np_random.bit_generator.state, env.get_wrapper_attr("time")
