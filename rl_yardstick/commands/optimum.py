@@ -18,7 +18,6 @@ EPILOG = """\
 examples:
   python -m rl_yardstick optimum --env FrozenLake-v1 --env-kwargs map_name:8x8
   python -m rl_yardstick optimum --env Taxi-v4 --env-kwargs fickle_passenger:True --model 1000000
-  python -m rl_yardstick optimum --env my_world.py:World   # a class; its code runs
 """
 MOST_STARTS, APART = 3, " " * 3  # starts that are named; between words and figures
 

@@ -1,4 +1,4 @@
-"""One small world of nine short stories, and the log of what a program did in it."""
+"""One small world of ten short stories, and the log of what a program did in it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,8 @@ class Story:
 
 STORIES = (
     Story((0,), shows=7),  # terminates in front of a rich state
-    Story((1, 2, 3, 4, 5, 6), shows=7, is_cut=True),  # longer than short rollouts
+    Story((1, 2, 3, 4)),
+    Story((5, 6), shows=7, is_cut=True),
     Story((9, 10)),  # rewards beyond 1
     Story((13,)),
     Story((19,), shows=8, is_cut=True),

@@ -74,13 +74,6 @@ def test_what_cannot_be_read_says_which_method_to_add(verdict_on):
     assert "add the method values(obs)" in found.lines()[-1]
 
 
-def test_a_short_rollout_that_ends_like_an_episode_is_seen(verdict_on):
-    counted = "age = 1 if step == 0 or ended else age + 1\n        ended = done\n        "
-    counted += "value = 0.0 if terminated or age == 5 else"
-    found = verdict_on("table", "value = 0.0 if terminated else", counted, "_rollout")
-    assert (found.state, found.fault) == ("wrong", "")
-
-
 def test_the_best_action_of_the_own_state_is_not_called_another_fault(verdict_on):
     old, new = "q[following].max()", "q[following, q[obs].argmax()]"
     found = verdict_on("table", old, new, "_own_best")
