@@ -351,7 +351,7 @@ class Deal(World):
 
 def test_seeds_of_resets() -> None:
     """Each seed gives a start; steps stay random. Playing each card well is right in 0.8."""
-    with pytest.raises(NotFinite, match=r"`reset` has more than .* outcomes \(--starts 0 1 2"):
+    with pytest.raises(NotFinite, match=r"more than .* outcomes \(optimum --starts 0 1 2"):
         model_of(Deal(climb), seconds=1.0)
     found = model_of(Deal(climb), starts=[0, 1, 2], **PATIENT)
     assert found.model.initial[found.model.initial > 0] == pytest.approx([1 / 3] * 3)

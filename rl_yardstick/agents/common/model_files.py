@@ -9,7 +9,7 @@ import re
 import secrets
 import warnings
 import zipfile
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -86,7 +86,7 @@ def encode(value: Any) -> Any:
     """Turn ``value`` into JSON."""
     if type(value) in _AS_THEY_ARE:
         return value
-    if type(value) is dict:  # fast path for Monitor's hundred episode records
+    if type(value) in (dict, OrderedDict):  # a VecEnv's observations; Monitor's episode records
         return {TYPE: "dict", "pairs": [[*map(encode, pair)] for pair in value.items()]}
     if isinstance(value, np.generic):
         value = value.item()

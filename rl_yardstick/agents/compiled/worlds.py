@@ -417,7 +417,8 @@ def _finite_model(env: Env) -> FiniteModel:
     observations = observations_of_states(env)
     check = model_check(env)
     if check is not None and check.refusal is not None:
-        raise NotCompilable(check.refusal)
+        has_own = hasattr(env.unwrapped, "P")
+        raise NotCompilable(check.refusal if has_own else "the environment publishes no model")
     if check is None or model is None or observations is None:
         raise NotCompilable("the environment's transition model is not known")
     if model.reward_variance is not None:

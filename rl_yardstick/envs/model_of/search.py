@@ -283,7 +283,7 @@ class Search:
         """What there is most of: outcomes, or values of an attribute."""
         if not self.rows:
             what = "a step" if self.initial else "`reset`"
-            hint = "" if self.initial else " (--starts 0 1 2 takes three)"
+            hint = "" if self.initial else " (optimum --starts 0 1 2 takes three)"
             return f"{what} has more than {self.runs:,} outcomes{hint}"
         values = self._values(sample := self.saved[:: max(1, len(self.saved) // 500)])
         name = max(values, key=lambda name: len(values[name]), default="state")
