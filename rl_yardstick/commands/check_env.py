@@ -12,7 +12,7 @@ from rl_yardstick.commands.cli import OneLineParser, flag, shared
 EPILOG = """\
 examples:
   python -m rl_yardstick check-env CartPole-v1
-  python -m rl_yardstick check-env warehouse.py:Warehouse --env-kwargs slip:0.1 --json found.json
+  python -m rl_yardstick check-env Warehouse-v0 --env-kwargs slip:0.1 --json found.json
 
 Exit code: 0 if nothing breaks trainings, 1 if something does, 2 after a mistake in the command.
 """
@@ -41,9 +41,11 @@ def main() -> int:
     if sys.platform != "win32":
         signal.signal(signal.SIGALRM, lambda *_: sys.exit(LATE))
         signal.alarm(max(17 - int(time.monotonic() - begin), 5))  # seconds; a call may hang
-    found = examine(lambda: make_env(args.env, kwargs))
-    if sys.platform != "win32":
-        signal.alarm(0)
+    try:
+        found = examine(lambda: make_env(args.env, kwargs))
+    finally:
+        if sys.platform != "win32":
+            signal.alarm(0)
     console, seconds = table_console(), time.monotonic() - begin
     for one in found:
         console.print(str(one), style="red" if one.level == "breaks" else None)
