@@ -47,7 +47,7 @@ from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.diagnosis import audit as audits
 from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.diagnosis.explanation import explanation
-from rl_yardstick.envs import found_models, known_models
+from rl_yardstick.envs import found_models
 from rl_yardstick.experiments.plan import StudyRecord, specs_of
 from rl_yardstick.experiments.pool import REGISTRATIONS
 from rl_yardstick.experiments.results import read_evaluations
@@ -55,6 +55,7 @@ from rl_yardstick.mdp.transition_model import TransitionModel
 from rl_yardstick.pipeline import training
 from rl_yardstick.pipeline.environments import check_env_id, make_env
 from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown, unknown
+from rl_yardstick.pipeline.evaluation.exact import known_model
 from rl_yardstick.pipeline.files import read_json, read_text
 from rl_yardstick.pipeline.models import Wanted, load_agent, model_of_run
 from rl_yardstick.pipeline.playing import playing_env
@@ -250,11 +251,7 @@ def model(env: Any, **env_kwargs: Any) -> TransitionModel:
     """The exact `TransitionModel` of a finite environment: its own, or found in its code."""
     env_id, kwargs = _environment(env)
     with closing(make_env(env_id, kwargs | env_kwargs)) as made:
-        if (found := known_models.transition_model(made)) is None:
-            check = known_models.model_check(made)
-            reason = "" if check is None else f": {check.refusal}"
-            raise UserError(f"the model of {env_id} is not known{reason}")
-        return found
+        return known_model(made, env_id)
 
 
 def check_env(env: Any, **env_kwargs: Any) -> Told:

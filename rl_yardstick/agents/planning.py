@@ -26,10 +26,10 @@ from rl_yardstick.agents.common.model_files import TablePolicy
 from rl_yardstick.envs.cut_world import cut_world
 from rl_yardstick.envs.known_models import (
     action_masks_of_states,
-    model_check,
     observations_of_states,
     time_limit,
     transition_model,
+    why_unknown,
 )
 from rl_yardstick.mdp import (
     TransitionModel,
@@ -199,9 +199,8 @@ class PlanningAgent(OnlineAlgorithm):
             if (model := self.cut_world) is not None:
                 observations = np.arange(model.n_states)
         if model is None or observations is None:
-            check = model_check(env)
-            why = "" if check is None or check.refusal is None else f": {check.refusal}"
-            raise ValueError(f"{name} needs an environment whose transition model is known{why}")
+            reason = "" if (why := why_unknown(env)) is None else f": {why}"
+            raise ValueError(f"{name} needs an environment whose transition model is known{reason}")
         if observations.ndim != 1:
             raise ValueError(f"{name} needs observations that are the numbers of the states")
         mask = action_masks_of_states(env) if self.mask_actions else None

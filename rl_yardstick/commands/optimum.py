@@ -69,17 +69,16 @@ def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> Optimum:
     from rl_yardstick.commands.terminal import scale_lines
     from rl_yardstick.envs import known_models as known
     from rl_yardstick.pipeline.environments import with_files_read
+    from rl_yardstick.pipeline.evaluation.exact import known_model
     from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
     from rl_yardstick.rating.worlds import world_of
 
     world = world_of(env_id, with_files_read(env_id, {"env_kwargs": {**kwargs}})["env_kwargs"])
-    model, horizon = known.transition_model(world.env), known.time_limit(world.env)
-    search = known.found_claim(world.env)
+    model, horizon = known_model(world.env, env_id), known.time_limit(world.env)
+    if horizon is None:
+        raise UserError(f"{env_id} has no limit on steps, which the optimum needs")
+    search = known.found_model(world.env)
     masks = known.action_masks_of_states(world.env) if search is None else search.mask
-    if model is None or horizon is None:
-        check = known.model_check(world.env)
-        reason = "" if check is None else f": {check.refusal}"
-        raise UserError(f"the model of {env_id} is not known{reason}")
     values, actions = mdp.optimal_choices(model, horizon)
     if masks is not None:
         actions &= masks | ~model.reachable[:, None]

@@ -113,17 +113,6 @@ def _discount(spec: TrainSpec) -> float:
     return float(found)
 
 
-def _model(spec: TrainSpec, env: gym.Env[Any, Any]) -> TransitionModel:
-    """The model of an environment with its wrappers; `UserError` if it is not known."""
-    from rl_yardstick.envs.known_models import model_check, transition_model
-
-    if (model := transition_model(env)) is not None:
-        return model
-    check = model_check(env)
-    reason = "so there is no optimum" if check is None else check.refusal
-    raise UserError(f"the model of {spec.env_id} is not known: {reason}")
-
-
 # --- results --------------------------------------------------------------------------------------
 
 
@@ -208,10 +197,11 @@ def _compared(spec: TrainSpec, env: gym.Env[Any, Any], discount: float) -> Compa
     from rl_yardstick.envs.known_models import time_limit
     from rl_yardstick.mdp.shaping import discounted_effect, effect_under_limit
     from rl_yardstick.pipeline.environments import make_single_env
+    from rl_yardstick.pipeline.evaluation.exact import known_model
 
     with closing(make_single_env(spec, training=True)) as training:
-        shaped = _model(spec, training)
-    original, horizon = _model(spec, env), time_limit(env)
+        shaped = known_model(training, spec.env_id)
+    original, horizon = known_model(env, spec.env_id), time_limit(env)
     assert horizon is not None  # evaluations always have one
     effects = {}
     try:

@@ -31,7 +31,7 @@ from rl_yardstick.envs.finite_spaces import Bijection
 from rl_yardstick.envs.model_of import FoundModel, NotFinite, Unfinished, model_of
 from rl_yardstick.envs.model_of.check import seeded_globally
 from rl_yardstick.envs.published_models import copy_of, is_changed
-from rl_yardstick.mdp.transition_model import Bools, TransitionModel
+from rl_yardstick.mdp.transition_model import TransitionModel
 
 Env = gym.Env[Any, Any]
 
@@ -71,34 +71,23 @@ def limits() -> Limits | None:
     return _limits.get()
 
 
-@dataclass(frozen=True, eq=False)
-class FoundClaim:
-    """What a search found of an environment."""
-
-    model: TransitionModel
-    mask: Bools | None  #: actions that raise no error, bool of shape (S, A); None if all
-    observations: NDArray[Any] | None  #: of each state; None where they make no array
-    horizon: int | None  #: the environment's own limit on steps
-    notes: tuple[str, ...]  #: what a reader of the figures should know
-    seconds: float  #: that the search took
-
-
 @dataclass(frozen=True)
 class NotFound:
     """Why a search found no model."""
 
     reason: str  #: in one line
-    ends_at_limit: bool = False  #: whether a longer search might find one
+    is_at_limit: bool = False  #: whether a longer search might find one
 
 
-_of_object: WeakKeyDictionary[Env, tuple[Limits, FoundClaim | NotFound]] = WeakKeyDictionary()
-_of_name: dict[str, FoundClaim | NotFound] = {}
+_of_object: WeakKeyDictionary[Env, tuple[Limits, FoundModel | NotFound]] = WeakKeyDictionary()
+_of_name: dict[str, FoundModel | NotFound] = {}
 
 
-def found(core: Env) -> FoundClaim | NotFound | None:
+def found(core: Env) -> FoundModel | NotFound | None:
     """The model of an environment, or why there is none; None if none is to be searched.
 
-    A search leaves the environment as it is: it works on a copy.
+    In the model, an action that is not allowed does what an allowed one does; observations are in
+    an array, or None. A search leaves the environment as it is: it works on a copy.
     """
     wanted, is_own = limits(), type(core).__module__.startswith("rl_yardstick.")
     is_own &= not isinstance(core, gym.Wrapper)
@@ -109,7 +98,7 @@ def found(core: Env) -> FoundClaim | NotFound | None:
     return _of_object[core][1]
 
 
-def _by_name(core: Env, limits: Limits) -> FoundClaim | NotFound:
+def _by_name(core: Env, limits: Limits) -> FoundModel | NotFound:
     """The result of an earlier search in the same code, or of a new one."""
     if is_changed(core.unwrapped):  # a method of the copy may act on the original
         return NotFound("a method was replaced by hand")
@@ -130,7 +119,7 @@ def _by_name(core: Env, limits: Limits) -> FoundClaim | NotFound:
     return _of_name[name]
 
 
-def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
+def _search(env: Env, limits: Limits) -> FoundModel | NotFound:
     begin, is_said = time.perf_counter(), False
 
     def progress(n_states: int, _n_done: int) -> None:
@@ -157,9 +146,8 @@ def _search(env: Env, limits: Limits) -> FoundClaim | NotFound:
         return NotFound(f"{error}{more}", is_limit)
     except (Exception, SystemExit) as error:  # noqa: BLE001  # its code may do anything
         return NotFound(f"it raised {type(error).__name__}: {' '.join(str(error).split())}")
-    model, observations = _legal(found), _stacked(env.observation_space, found)
-    notes = tuple(found.notes)
-    return FoundClaim(model, found.mask, observations, found.horizon, notes, found.seconds)
+    observations = _stacked(env.observation_space, found)
+    return replace(found, model=_legal(found), observations=observations)
 
 
 def _legal(found: FoundModel) -> TransitionModel:
@@ -233,7 +221,7 @@ def _folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "yardstick" / "models"
 
 
-def _read(file: Path) -> FoundClaim | NotFound | None:
+def _read(file: Path) -> FoundModel | NotFound | None:
     """What a file holds; None where there is none, or it cannot be read."""
     with suppress(OSError, ValueError, KeyError, BadZipFile), np.load(file) as held:
         arrays = dict(held)
@@ -242,16 +230,15 @@ def _read(file: Path) -> FoundClaim | NotFound | None:
             is_old = time.time() - file.stat().st_mtime > SECONDS_OF_REFUSALS
             return None if is_old else NotFound(**told)
         own = {name: arrays.pop(name, None) for name in ("mask", "observations")}
-        told["notes"] = tuple(told["notes"])
-        return FoundClaim(TransitionModel(**arrays), **own, **told)
+        return FoundModel(TransitionModel(**arrays), **own, **told)
     return None
 
 
-def _write(file: Path, result: FoundClaim | NotFound) -> None:
+def _write(file: Path, result: FoundModel | NotFound) -> None:
     """Write a file, and remove all but the newest; nothing where the folder cannot be written."""
     told = dict(vars(result))
     arrays = {name: told.pop(name, None) for name in ("mask", "observations")}
-    if isinstance(result, FoundClaim):
+    if isinstance(result, FoundModel):
         model = told.pop("model")
         arrays |= {each.name: getattr(model, each.name) for each in fields(model)}
     kept = {name: array for name, array in arrays.items() if array is not None}

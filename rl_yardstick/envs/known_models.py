@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from rl_yardstick.envs import found_models
 from rl_yardstick.envs.finite_env import FiniteEnv, MaskedFiniteEnv
-from rl_yardstick.envs.found_models import FoundClaim
+from rl_yardstick.envs.found_models import NotFound
 from rl_yardstick.envs.grid import GOAL, GridWorld
+from rl_yardstick.envs.model_of import FoundModel
 from rl_yardstick.envs.published_models import (
     Claim,
     ModelCheck,
@@ -61,7 +62,7 @@ TRANSPARENT_WRAPPERS = frozenset(
 )
 OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation)
 
-Judgement = tuple[Claim | FoundClaim | None, ModelCheck | None]
+Judgement = tuple[Claim | FoundModel | NotFound | None, ModelCheck | None]
 
 # A cache of judgements of environments, by `id`: set only while these live.
 _looked_at: dict[int, Judgement] = {}
@@ -98,25 +99,36 @@ def transition_model(env: Env) -> TransitionModel | None:
 
 
 def model_check(env: Env) -> ModelCheck | None:
-    """The result of testing the environment's model against its `step`; None without a model.
+    """The test of the model that the environment brings against its `step`; None if it has none.
 
-    Trusted environments pass without a test. Where no model was found, it says why.
+    Trusted environments pass without a test.
     """
     return _judged(_core_of(env)[0])[1]
 
 
-def found_claim(env: Env) -> FoundClaim | None:
+def found_model(env: Env) -> FoundModel | None:
     """What a search has found of an environment; None where the model is not from a search."""
-    claim = _judged(_core_of(env)[0])[0]
-    return claim if isinstance(claim, FoundClaim) else None
+    found = _judged(_core_of(env)[0])[0]
+    return found if isinstance(found, FoundModel) else None
+
+
+def why_unknown(env: Env, at_limits_only: bool = False) -> str | None:
+    """Why the model is not known, in one line; None where it is, or nothing is to be said.
+
+    With ``at_limits_only``, a search has nothing to say but that it ended at its limits.
+    """
+    found, check = _judged(_core_of(env)[0])
+    if not isinstance(found, NotFound):
+        return None if check is None else check.refusal
+    return found.reason if found.is_at_limit or not at_limits_only else None
 
 
 def time_limit(env: Env) -> int | None:
     """The number of steps after which an episode is cut off, None where there is no limit."""
     wrappers = layers(env)[1]
     limits = [w._max_episode_steps for w in wrappers if isinstance(w, gym.wrappers.TimeLimit)]
-    if (claim := found_claim(env)) is not None and claim.horizon is not None:
-        limits.append(claim.horizon)
+    if (found := found_model(env)) is not None and found.horizon is not None:
+        limits.append(found.horizon)
     return min(limits, default=None)
 
 
@@ -135,7 +147,7 @@ def success_outcomes(env: Env) -> Bools | None:
     ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]
     if not ends.any():
         return None
-    if isinstance(base, GridWorld) and not isinstance(claim, FoundClaim):
+    if isinstance(base, GridWorld) and not isinstance(claim, FoundModel):
         codes = np.frombuffer(base.map.codes, np.uint8)
         good = codes[model.next_state % base.map.n_cells] == ord(GOAL)
     elif isinstance(base, BlackjackEnv):
@@ -167,8 +179,8 @@ def action_masks_of_states(env: Env) -> Bools | None:
     idle = [wrapper.masks for wrapper in wrappers if isinstance(wrapper, IdleActionMasks)]
     if idle:
         return np.array(idle[-1])
-    if isinstance(claim := _judged(core)[0], FoundClaim):
-        return claim.mask if mask_source(env) is None else None
+    if isinstance(found := _judged(core)[0], FoundModel):
+        return found.mask if mask_source(env) is None else None
     # A subclass may have masks of its own.
     base: Any = core
     kind: Any = type(core)
@@ -213,10 +225,11 @@ def folds(wrapper: Wrapper) -> bool:
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
 
 
-def _believed(core: Env) -> Claim | FoundClaim | None:
+def _believed(core: Env) -> Claim | FoundModel | None:
     """What is known of an environment's dynamics, if it stands the test."""
     claim, check = _judged(core)
-    return claim if check is not None and check.refusal is None else None
+    is_refused = check is not None and check.refusal is not None
+    return None if isinstance(claim, NotFound) or is_refused else claim
 
 
 @contextmanager
@@ -235,26 +248,16 @@ def _judged(core: Env) -> Judgement:
     if id(core) in _looked_at:
         return _looked_at[id(core)]
     if isinstance(core, gym.Wrapper):
-        return _searched(core)
+        return found_models.found(core), None
     try:
         claim = claim_of(core)
     except ValueError as error:
         return None, ModelCheck(str(error))
     if claim is None:
-        return _searched(core)
+        return found_models.found(core), None
     if not is_trusted(core):
         return claim, checked(claim)
     # Blackjack draws cards, and random rewards have only their means in the model.
     draws = isinstance(core, FiniteEnv) and claim.model.reward_variance is not None
     plays = not draws and not isinstance(core, BlackjackEnv)
     return claim, ModelCheck(None, bit_for_bit=plays, state_can_be_set=plays)
-
-
-def _searched(core: Env) -> Judgement:
-    """What a search finds of an environment's dynamics."""
-    found = found_models.found(core)
-    if found is None:
-        return None, None
-    if isinstance(found, FoundClaim):
-        return found, ModelCheck(None)
-    return None, ModelCheck(found.reason, is_surprising=found.ends_at_limit)

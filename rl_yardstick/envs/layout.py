@@ -18,7 +18,7 @@ from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
 
 from rl_yardstick.envs.grid import MOVES, Grid, GridWorld, Tile
-from rl_yardstick.envs.known_models import found_claim
+from rl_yardstick.envs.known_models import found_model
 from rl_yardstick.envs.textbook.grids import WindyGridworldEnv
 from rl_yardstick.mdp.transition_model import Ints
 
@@ -139,7 +139,7 @@ def state_name(env: gym.Env[Any, Any], layout: GridLayout | None, state: int) ->
         row, column, passenger, target = base.decode(state)
         where = "on board" if passenger == 4 else f"at {'RGYB'[passenger]}"
         return f"row {row + 1}, column {column + 1}, passenger {where}, to {'RGYB'[target]}"
-    if (found := found_claim(env)) is not None and found.observations is not None:
+    if (found := found_model(env)) is not None and found.observations is not None:
         shown = " ".join(str(found.observations[state]).split())
         return f"state {state}, seen as {textwrap.shorten(shown, 40, placeholder=' ...')}"
     return f"state {state}"

@@ -121,7 +121,6 @@ class ModelCheck:
     #: or has nothing to sample: then the model gives the same episodes with the same generator
     bit_for_bit: bool = False
     state_can_be_set: bool = False  #: whether setting the attribute ``s`` sets the state
-    is_surprising: bool = True  #: whether a user would expect a model
 
 
 _checks: dict[tuple[Any, ...], ModelCheck] = {}

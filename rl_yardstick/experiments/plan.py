@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.envs.known_models import found_claim, time_limit
+from rl_yardstick.envs.known_models import found_model, time_limit
 from rl_yardstick.experiments.study import (
     AS_IT_COMES,
     AgentSpec,
@@ -171,7 +171,7 @@ def specs_of(study: StudySpec) -> dict[Labels, TrainSpec]:
             specs[agent.label, environment.label] = spec = _train_spec(study, agent, environment)
             check_fit(spec)
             with closing(make_single_env(spec)) as env:
-                found_claim(env)  # a search is done once, before the workers begin
+                found_model(env)  # a search is done once, before the workers begin
         except UserError as error:
             place = f"{agent.where}: " if agent.where else ""
             raise UserError(f"{place}{agent.label} on {environment.label}: {error}") from error

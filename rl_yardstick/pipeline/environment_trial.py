@@ -152,9 +152,11 @@ def look_at_calls(found: Findings, env: Any) -> None:
         told = "Gymnasium calls reset(seed=..., options=...), which the environment does not take"
         found.add("old-api", told, "reset")
         return
+    actions = copy.deepcopy(env.action_space)
+    actions.seed(SEED)
     for call, wanted in (("reset", START), ("step", ACTION)):
         if call == "step":
-            given = env.step(copy.deepcopy(env.action_space).sample())
+            given = env.step(actions.sample())
         if not isinstance(given, tuple) or len(given) != len(wanted.split()):
             told = f"{len(given)} values" if isinstance(given, tuple) else "one value"
             found.add("old-api", f"{call} returns {told}, not {wanted}", call)

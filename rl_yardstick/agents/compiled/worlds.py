@@ -15,7 +15,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.envs.known_models import (
-    found_claim,
     model_check,
     observations_of_states,
     one_look,
@@ -387,10 +386,8 @@ def compile_envs(vec_env: VecEnv) -> World:
 
 def draws_alike(vec_env: DummyVecEnv) -> bool:
     """Whether compiled environments use the same random numbers for the same purposes."""
-    ours = CartPoleEnv, MountainCarEnv  # which compile without a model
-    envs = [env for env in vec_env.envs if not isinstance(env.unwrapped, ours)]
-    own = [env for env in envs if not is_trusted(env.unwrapped)]
-    return all(check is None or check.bit_for_bit for check in map(model_check, own))
+    checks = [model_check(env) for env in vec_env.envs if not is_trusted(env.unwrapped)]
+    return all(check is None or check.bit_for_bit for check in checks)
 
 
 def _world_of(env: Env) -> World:
@@ -418,11 +415,10 @@ def _finite_model(env: Env) -> FiniteModel:
     model = transition_model(env)
     observations = observations_of_states(env)
     check = model_check(env)
-    if check is not None and check.refusal is not None:
-        has_own = hasattr(env.unwrapped, "P")
-        raise NotCompilable(check.refusal if has_own else "the environment publishes no model")
-    if check is None or model is None or observations is None:
-        raise NotCompilable("the environment's transition model is not known")
+    if check is None:
+        raise NotCompilable("the environment publishes no model")
+    if model is None or observations is None:
+        raise NotCompilable(check.refusal or "the environment's transition model is not known")
     if model.reward_variance is not None:
         raise NotCompilable("rewards are drawn, and the environment's model holds their means")
     # A wrapper may keep the dynamics but still need every step, for example to film it.
@@ -430,8 +426,6 @@ def _finite_model(env: Env) -> FiniteModel:
     if watching:
         names = ", ".join(sorted(wrapper.__name__ for wrapper in watching))
         raise NotCompilable(f"{names} must see every step")
-    if found_claim(env) is not None:
-        raise NotCompilable("the environment publishes no model")
     if not check.state_can_be_set:
         raise NotCompilable("the environment does not continue from the state that s is set to")
     monitor = monitor_of(env)

@@ -50,7 +50,7 @@ class FoundModel:
 
     model: TransitionModel
     mask: Bools | None  # actions that raise no error, bool of shape (S, A); None if all
-    observations: list[Any]  # what each state shows
+    observations: Any  # what each state shows, in a list
     actions: list[int]  # of the environment, in the order of the model
     horizon: int | None  # the environment's own limit on steps
     notes: list[str]  # what a reader of the figures should know

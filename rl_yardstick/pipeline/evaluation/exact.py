@@ -25,12 +25,13 @@ from rl_yardstick import mdp
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs import found_models, known_models
 from rl_yardstick.envs.cut_world import cut_world
-from rl_yardstick.envs.found_models import FoundClaim
 from rl_yardstick.envs.layout import GridLayout, grid_layout
+from rl_yardstick.envs.model_of import FoundModel
 from rl_yardstick.mdp.beliefs import Bracket, memory_optimum
 from rl_yardstick.mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
 from rl_yardstick.mdp.transition_model import Bools, Floats
 from rl_yardstick.pipeline.environments import kwargs_of, make_single_env, training_changes
+from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import (
     FAILED,
     Evaluation,
@@ -150,7 +151,7 @@ class ExactEvaluator:
     layout: GridLayout | None = None  #: where the states lie on a map, for grid worlds
     masks: Bools | None = None  #: action masks, shape (S, A), for agents that use them
     scale: HiddenScale | None = None  #: the optima if observations hide the state
-    found: FoundClaim | None = None  #: the search, if it found the model
+    found: FoundModel | None = None  #: the search, if it found the model
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """Evaluate the agent's current policy exactly."""
@@ -322,7 +323,7 @@ def evaluator_in(env: gym.Env[Any, Any]) -> ExactEvaluator | None:
     baseline = float(mdp.baseline_return(model, horizon))
     scale = hidden_scale(model, observations, horizon, optimum, baseline)
     yardstick = Yardstick(optimum, baseline) if scale is None else scale.yardstick(False)
-    found = known_models.found_claim(env)
+    found = known_models.found_model(env)
     return ExactEvaluator(
         model, observations, horizon, success, yardstick, layout, masks, scale, found
     )
@@ -356,11 +357,17 @@ def _optimum(model: mdp.TransitionModel, horizon: int) -> float | None:
     return mdp.finite_horizon_optimum(model, horizon).start_value
 
 
+def known_model(env: gym.Env[Any, Any], env_id: str) -> mdp.TransitionModel:
+    """The model of an environment with its wrappers; UserError if it is not known."""
+    if (model := known_models.transition_model(env)) is not None:
+        return model
+    reason = "" if (why := known_models.why_unknown(env)) is None else f": {why}"
+    raise UserError(f"the model of {env_id} is not known{reason}")
+
+
 def model_refusal(spec: TrainSpec, only_surprising: bool = True) -> str | None:
     """Why the environment's model is not known, in one line; None if it is, or no surprise."""
     if is_wrapped_as_vector(spec):
         return None
     with closing(make_single_env(spec)) as env:
-        check = known_models.model_check(env)
-    is_told = check is not None and (check.is_surprising or not only_surprising)
-    return check.refusal if check is not None and is_told else None
+        return known_models.why_unknown(env, only_surprising)
