@@ -117,7 +117,7 @@ def test_around_what_is_not_known_a_search_finds_the_same(what):
     found, best = (finite_horizon_optimum(each, 100).start_value for each in models)
     # Every episode ends with the reward of 5, by a termination or by time.
     assert found == pytest.approx(5.0 if what == "on_truncation" else best, abs=1e-9)
-    assert known.found_claim(plain) is None
+    assert known.found_model(plain) is None
 
 
 UNKNOWN = {

@@ -1,5 +1,6 @@
 """The models that `model_of` finds, against published models and figures known by other means."""
 
+import importlib
 import random
 import re
 import sys
@@ -399,3 +400,16 @@ def test_the_environment_is_left_as_it_was() -> None:
     assert isinstance(env.env.env, gym.Wrapper)
     env.reset(seed=1)
     env.step(0)
+
+
+@pytest.mark.parametrize(
+    ("name", "n_states", "best"),
+    [("MiniGrid-Empty-5x5-v0", 32, 0.955), ("MiniGrid-DoorKey-5x5-v0", 1608, 0.9646)],
+)
+def test_minigrid(name: str, n_states: int, best: float) -> None:
+    """Every state but the goal's stands in the model once for each step of the episode."""
+    importlib.import_module("minigrid")  # registers its environments
+    env = gym.make(name)
+    found = model_of(env, **PATIENT)
+    assert found.model.n_states == n_states * found.horizon
+    assert optimum(found, found.horizon) == pytest.approx(best, abs=1e-4)
