@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import pairwise
@@ -90,6 +92,8 @@ def audit(subject: Subject, seeds: int = 0) -> Verdict:
 VISITS = 40  # of a cell whose value counts
 OF_ONE_STEP = ("next-value-is-", "follows-", "maximises-")  # faults, not of traces and the like
 LENGTHS = (1, 2, 4)  # of trainings, until values have settled
+RATES = re.compile(r"(eps|exploration)(?!.*(decay|frac|step))", re.I)  # settings by their names
+ROLLOUTS = ("n", "n_step", "n_steps", "num_steps", "rollout", "rollout_length", "rollout_steps")
 
 
 class Near(NamedTuple):
@@ -144,9 +148,10 @@ class _ByValues:
         if start is None:
             return Verdict(self.subject.name, "unreadable", notes=(NO_VALUES,))
         self.is_table = is_table(start)
-        length, before, last = 6800 if self.is_table else 8500, np.inf, np.inf
+        self.length = length = 6800 if self.is_table else 8500
+        n_seeds, before, last = self.n_seeds or (3 if self.is_table else 2), np.inf, np.inf
         for times in LENGTHS:
-            trainings = self._trainings(times * length)
+            trainings = self._trainings(times * length, n_seeds)
             if not np.isfinite([one.values for one in trainings]).all():
                 return Verdict(self.subject.name, "wrong", notes=("its values are not finite",))
             rule, near = self._by_rules(trainings)
@@ -160,10 +165,10 @@ class _ByValues:
             return replace(found, state="unreadable", notes=(note,))
         return found
 
-    def _trainings(self, n: int) -> list[_Training]:
+    def _trainings(self, n: int, n_seeds: int, **changes: Any) -> list[_Training]:
         found = []
-        for seed in range(1, 1 + (self.n_seeds or (3 if self.is_table else 2))):
-            trained, begun = (self.subject.train(steps, seed) for steps in (n, 3))
+        for seed in range(1, 1 + n_seeds):
+            trained, begun = (self.subject.train(steps, seed, **changes) for steps in (n, 3))
             assert trained.values is not None
             assert begun.values is not None
             steps = reduce(Steps.joined, [Steps(log, late=0.35) for log in trained.logs])
@@ -191,7 +196,7 @@ class _ByValues:
         backup = measured(one.values, one.steps, rule)
         verdict = partial(Verdict, self.subject.name, target=backup.words(), measured=backup)
         if right.rms <= 0.5 and right.worst <= 3 and right.rms <= near[0].rms + 0.1:
-            if other_fault := self._other_fault(trainings):
+            if other_fault := self._other_fault(trainings, rule):
                 return verdict("wrong", other_fault[0], notes=(other_fault[1],))
             unseen = UNSEEN_OF_ACTORS if rule == "states" else UNSEEN
             return verdict("right", unseen="" if self.is_table else unseen)
@@ -207,12 +212,32 @@ class _ByValues:
         is_named &= self.subject.is_one_step or not fault.startswith(OF_ONE_STEP)
         return verdict("wrong", fault if is_named else "", notes=(note,))
 
-    def _other_fault(self, trainings: Sequence[_Training]) -> tuple[str, str] | None:
+    def _other_fault(self, trainings: Sequence[_Training], rule: str) -> tuple[str, str] | None:
         """A fault that leaves the values right, and the sentence that shows it."""
         checks: list[Callable[[], tuple[str, str] | None]] = [partial(_choices, trainings)]
         if self.is_table:
             checks.append(partial(_credit, self.subject))
+        checks.append(partial(self._with_other_settings, rule))
         return next(filter(None, (check() for check in checks)), None)
+
+    def _with_other_settings(self, rule: str) -> tuple[str, str] | None:
+        """What it does without exploration, and with rollouts of two steps, if it has settings."""
+        rates = {name: 1e-9 for name in self.subject.parameters if RATES.match(name)}
+        length = self.subject.named(*ROLLOUTS)
+        with suppress(CannotTrain):  # it may not be made for such settings
+            if rates and rule != "states":
+                [(q, _, d, _)] = self._trainings(self.length // 2, 1, **rates)
+                is_clear = (d.weight > 0) & (np.ptp(q, axis=1)[d.state] > 0.3)
+                share = float(np.mean((q[d.state, d.action] < q.max(axis=1)[d.state])[is_clear]))
+                if share > 0.25:
+                    told = f"with {' and '.join(rates)} at 0, {share:.0%} of its actions are not its best"
+                    return "exploration-inverted", told
+            if length:
+                [(q, _, d, _)] = short = self._trainings(self.length, 1, **{length: 2})
+                right = next(near for near in nearest(short, rule) if near.name == RIGHT)
+                if right.rms > 1 and any((found := measured(q, d, rule)).off()):
+                    return "", f"with {length} at 2, {found.words()}"
+        return None
 
 
 ACTS_WORSE = "advantage-sign or ratio-inverted"  # from outside they are the same

@@ -81,6 +81,11 @@ def test_the_best_action_of_the_own_state_is_not_called_another_fault(verdict_on
     assert not found.fault or "next-value-is-best-in-own-state" in found.fault
 
 
+def test_settings_do_what_their_names_say(verdict_on):
+    found = verdict_on("sarsa", "random() < self.epsilon", "random() > self.epsilon", "_inverted")
+    assert found.fault == "exploration-inverted"
+
+
 def test_what_training_raises_is_told_and_what_the_audit_raises_is_not_caught(
     verdict_on, monkeypatch
 ):
