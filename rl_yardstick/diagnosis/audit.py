@@ -230,8 +230,8 @@ class _ByValues:
                 is_clear = (d.weight > 0) & (np.ptp(q, axis=1)[d.state] > 0.3)
                 share = float(np.mean((q[d.state, d.action] < q.max(axis=1)[d.state])[is_clear]))
                 if share > 0.25:
-                    told = f"with {' and '.join(rates)} at 0, {share:.0%} of its actions are not its best"
-                    return "exploration-inverted", told
+                    told = f"{share:.0%} of its actions are not its best"
+                    return "exploration-inverted", f"with {' and '.join(rates)} at 0, {told}"
             if length:
                 [(q, _, d, _)] = short = self._trainings(self.length, 1, **{length: 2})
                 right = next(near for near in nearest(short, rule) if near.name == RIGHT)
