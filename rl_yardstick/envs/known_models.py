@@ -25,11 +25,11 @@ from rl_yardstick.envs.found_models import NotFound
 from rl_yardstick.envs.grid import GOAL, GridWorld
 from rl_yardstick.envs.model_of import FoundModel
 from rl_yardstick.envs.published_models import (
-    Claim,
     ModelCheck,
+    PublishedModel,
     checked,
-    claim_of,
     is_trusted,
+    published_model,
 )
 from rl_yardstick.envs.wrappers import (
     ActionMasks,
@@ -62,7 +62,7 @@ TRANSPARENT_WRAPPERS = frozenset(
 )
 OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation)
 
-Judgement = tuple[Claim | FoundModel | NotFound | None, ModelCheck | None]
+Judgement = tuple[PublishedModel | FoundModel | NotFound | None, ModelCheck | None]
 
 # A cache of judgements of environments, by `id`: set only while these live.
 _looked_at: dict[int, Judgement] = {}
@@ -77,10 +77,10 @@ def transition_model(env: Env) -> TransitionModel | None:
     time limit is no part of the model: see `time_limit`. None where the model is not known.
     """
     core, wrappers = _core_of(env)
-    claim = _believed(core)
-    if claim is None:
+    known = _believed(core)
+    if known is None:
         return None
-    model = claim.model
+    model = known.model
     reward, variance = model.reward, model.reward_variance
     for wrapper in wrappers:
         if isinstance(wrapper, ScaleReward):
@@ -140,14 +140,14 @@ def success_outcomes(env: Env) -> Bools | None:
     of FrozenLake and CliffWalking, the passenger delivered in Taxi. In Blackjack it is any win.
     None where the model is not known or no episode terminates.
     """
-    base, claim = env.unwrapped, _believed(_core_of(env)[0])
-    if claim is None:
+    base, known = env.unwrapped, _believed(_core_of(env)[0])
+    if known is None:
         return None
-    model = claim.model
+    model = known.model
     ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]
     if not ends.any():
         return None
-    if isinstance(base, GridWorld) and not isinstance(claim, FoundModel):
+    if isinstance(base, GridWorld) and not isinstance(known, FoundModel):
         codes = np.frombuffer(base.map.codes, np.uint8)
         good = codes[model.next_state % base.map.n_cells] == ord(GOAL)
     elif isinstance(base, BlackjackEnv):
@@ -161,8 +161,8 @@ def success_outcomes(env: Env) -> Bools | None:
 def observations_of_states(env: Env) -> NDArray[Any] | None:
     """The observation of each state of `transition_model`; None where it is not known."""
     core, wrappers = _core_of(env)
-    claim = _believed(core)
-    observations = None if claim is None else claim.observations
+    known = _believed(core)
+    observations = None if known is None else known.observations
     for wrapper in wrappers:
         if observations is not None and isinstance(wrapper, OBSERVATION_WRAPPERS):
             observations = wrapper.map_observations(observations)
@@ -225,11 +225,11 @@ def folds(wrapper: Wrapper) -> bool:
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
 
 
-def _believed(core: Env) -> Claim | FoundModel | None:
+def _believed(core: Env) -> PublishedModel | FoundModel | None:
     """What is known of an environment's dynamics, if it stands the test."""
-    claim, check = _judged(core)
+    known, check = _judged(core)
     is_refused = check is not None and check.refusal is not None
-    return None if isinstance(claim, NotFound) or is_refused else claim
+    return None if isinstance(known, NotFound) or is_refused else known
 
 
 @contextmanager
@@ -250,14 +250,14 @@ def _judged(core: Env) -> Judgement:
     if isinstance(core, gym.Wrapper):
         return found_models.found(core), None
     try:
-        claim = claim_of(core)
+        known = published_model(core)
     except ValueError as error:
         return None, ModelCheck(str(error))
-    if claim is None:
+    if known is None:
         return found_models.found(core), None
     if not is_trusted(core):
-        return claim, checked(claim)
+        return known, checked(known)
     # Blackjack draws cards, and random rewards have only their means in the model.
-    draws = isinstance(core, FiniteEnv) and claim.model.reward_variance is not None
+    draws = isinstance(core, FiniteEnv) and known.model.reward_variance is not None
     plays = not draws and not isinstance(core, BlackjackEnv)
-    return claim, ModelCheck(None, bit_for_bit=plays, state_can_be_set=plays)
+    return known, ModelCheck(None, bit_for_bit=plays, state_can_be_set=plays)

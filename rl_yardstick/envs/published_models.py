@@ -39,8 +39,8 @@ STEPS_IN_TURN = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Claim:
-    """An environment's claim about its dynamics, without wrappers, computed on first access."""
+class PublishedModel:
+    """The model that an environment brings, without wrappers, computed on first access."""
 
     base: Env
 
@@ -66,8 +66,8 @@ class Claim:
         return np.arange(space.n) + space.start if isinstance(space, gym.spaces.Discrete) else None
 
 
-def claim_of(base: Env) -> Claim | None:
-    """The claim of an environment without wrappers about its dynamics, None without a model.
+def published_model(base: Env) -> PublishedModel | None:
+    """The model that an environment without wrappers brings; None if it brings none.
 
     Raises:
         ValueError: where the model is invalid, in one line.
@@ -85,11 +85,11 @@ def claim_of(base: Env) -> Claim | None:
         brings_model = has_model and not getattr(base, "fickle_passenger", False)
     if not brings_model:
         return None
-    claim = Claim(base)
+    published = PublishedModel(base)
     if isinstance(base, OWN_CLASSES) and is_trusted(base):
-        return claim
+        return published
     try:
-        model, actions, observations = claim.model, base.action_space, claim.observations
+        model, actions, observations = published.model, base.action_space, published.observations
         if not isinstance(actions, gym.spaces.Discrete) or actions.n != model.n_actions:
             raise ValueError(f"it has {model.n_actions} actions, where the space is {actions}")
         if observations is not None and len(observations) != model.n_states:
@@ -98,11 +98,11 @@ def claim_of(base: Env) -> Claim | None:
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"the environment's P is no model: {text}") from error
-    return claim
+    return published
 
 
 def is_trusted(base: Env) -> bool:
-    """Whether an environment's claim about its dynamics needs no check."""
+    """Whether the model that an environment brings needs no check."""
     ours = isinstance(base, OWN_CLASSES) and type(base).__module__.startswith("rl_yardstick.envs.")
     return (ours or type(base) in TRUSTED_CLASSES) and not is_changed(base)
 
@@ -126,13 +126,13 @@ class ModelCheck:
 _checks: dict[tuple[Any, ...], ModelCheck] = {}
 
 
-def checked(claim: Claim) -> ModelCheck:
+def checked(published: PublishedModel) -> ModelCheck:
     """The test of a model, once for environments of the same class, arguments and model.
 
     A copy without wrappers plays the 20,000 steps of `envs.model_of.check`, and, if its attribute
     ``s`` sets the state, as many again from states drawn from all that the model can reach.
     """
-    base, model = claim.base, claim.model
+    base, model = published.base, published.model
     arguments = base if base.spec is None else (repr(base.spec.kwargs), base.spec.max_episode_steps)
     parts = model.prob, model.next_state, model.reward, model.terminated, model.initial
     key = type(base), arguments, model.prob.shape, *(hash(part.tobytes()) for part in parts)
@@ -140,14 +140,14 @@ def checked(claim: Claim) -> ModelCheck:
         if is_changed(base):  # a method of the copy may act on the original
             refusal = "a method was replaced by hand: P cannot be compared with it on a copy"
             return ModelCheck(refusal)
-        _checks[key] = _check(claim)
+        _checks[key] = _check(published)
     return _checks[key]
 
 
-def _check(claim: Claim) -> ModelCheck:
-    model = claim.model
+def _check(published: PublishedModel) -> ModelCheck:
+    model = published.model
     try:
-        played = Played(copy_of(claim.base), claim)
+        played = Played(copy_of(published.base), published)
         problem = refutation(played, model, played.state, played.actions)
         with seeded_globally(0):
             can_be_set = problem is None and played.can_be_set()
@@ -183,9 +183,9 @@ class Played(gym.Wrapper[Any, Any, Any, Any]):
 
     env: Any
 
-    def __init__(self, env: Any, claim: Claim) -> None:
+    def __init__(self, env: Any, published: PublishedModel) -> None:
         super().__init__(env)
-        self.model, self.observations = claim.model, claim.observations
+        self.model, self.observations = published.model, published.observations
         self.actions = list(range(self.model.n_actions))
         shown: Any = self.observations
         self.observes_states = np.array_equal(np.arange(self.model.n_states), shown)
