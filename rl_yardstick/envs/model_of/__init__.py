@@ -29,6 +29,7 @@ from rl_yardstick.envs.model_of.symbols import Limit, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 MOST_ACTIONS = 5000
+FEWEST_SECONDS = 20.0  # that the test of a model may take; else twice those of its search
 OUTSIDE = "something outside its attributes decides (a class, a global, the time of day)"
 
 
@@ -100,7 +101,8 @@ def model_of(
         state.restore_original(without_transparent=True)
         allowed = None if mask.all() else mask
         tested = _Seeded(state.layers[0], starts) if starts else state.layers[0]
-        if problem := refutation(tested, model, search.state_now, actions, allowed):
+        limit = max(2 * seconds, FEWEST_SECONDS)
+        if problem := refutation(tested, model, search.state_now, actions, allowed, seconds=limit):
             raise NotFinite(f"{OUTSIDE}: {problem}")
     except Stop as stop:
         kind = Unfinished if isinstance(stop, Limit) else NotFinite

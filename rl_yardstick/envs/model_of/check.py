@@ -13,11 +13,13 @@ import random
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from time import perf_counter
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from rl_yardstick.envs.model_of.symbols import Limit
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 STEPS, STEPS_PER_START = 20_000, 40
@@ -52,7 +54,8 @@ def refutation(
     actions: list[Any],
     mask: Bools | None = None,
     steps: int = STEPS,
-    seed: int = 0,
+    seed: int = 2,
+    seconds: float = math.inf,
 ) -> str | None:
     """What an environment does that a model of it does not say, in one line; None if nothing.
 
@@ -65,12 +68,20 @@ def refutation(
         mask: actions that are allowed, bool of shape (S, A); None for all.
         steps: how many steps to play.
         seed: of the environment, the actions and the global generators, which are restored.
+        seconds: the time after which the test gives up.
+
+    Raises:
+        Limit: if it gives up.
     """
-    rng, initial, state, time = np.random.default_rng(seed), model.initial, None, 0
+    rng = np.random.default_rng([seed, 1])  # no numbers that the environment draws
+    initial, state, time, begin = model.initial, None, 0, perf_counter()
     starts: Row = {(s, 0.0): [initial[s], 0.0] for s in np.flatnonzero(initial).tolist()}
     rows = {"reset": starts}
     with seeded_globally(seed):
         for taken, drawn in enumerate(rng.integers(len(actions), size=steps).tolist()):
+            if perf_counter() - begin > seconds:
+                told = f"{steps:,} steps, by which every model is tested, take too long"
+                raise Limit(f"{told}: {taken:,} in {seconds:g} seconds")
             if state is None:
                 seen, _ = env.reset(seed=None if taken else seed)
                 state, time = state_of(seen, 0), 0

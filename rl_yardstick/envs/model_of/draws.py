@@ -16,6 +16,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils import seeding
 
 from rl_yardstick.envs.model_of.symbols import NORMAL, TAIL, UNIFORM, Drawn, Stop, where
 
@@ -176,7 +177,9 @@ class NumpyDraws:
                 del weights[i]
         return picked
 
-    def choice(self, a: Any, size: Any = None, replace: bool = True, p: Any = None) -> Any:
+    def choice(
+        self, a: Any, size: Any = None, replace: bool = True, p: Any = None, shuffle: bool = True
+    ) -> Any:
         pool = np.arange(a) if isinstance(a, int | np.integer) else np.asarray(a)
         weights = None if p is None else [float(x) for x in p]
         if replace or size is None:
@@ -205,8 +208,11 @@ class PythonDraws(NumpyDraws):
     def choice(self, seq: Sequence[Any]) -> Any:  # type: ignore[override]
         return seq[self.randrange(len(seq))]
 
-    def choices(self, population: Sequence[Any], weights: Any = None, *, k: int = 1) -> list[Any]:
+    def choices(
+        self, population: Sequence[Any], weights: Any = None, *, cum_weights: Any = None, k: int = 1
+    ) -> list[Any]:
         self._script.visit()
+        weights = weights if cum_weights is None else np.diff(cum_weights, prepend=0.0).tolist()
         return [population[self._script.branch(weights or len(population))] for _ in range(k)]
 
     def sample(self, population: Sequence[Any], k: int) -> list[Any]:
@@ -218,26 +224,47 @@ GENERATORS = (np.random.Generator, np.random.RandomState, random.Random, NumpyDr
 NOT_REPLACED = {"_inst", "_rand", "getstate", "setstate", "get_state", "set_state"}
 
 
+def owner_of(value: Any) -> Any:
+    """The generator that a value is, or whose method it is; None if it is neither."""
+    owner = getattr(getattr(value, "func", value), "__self__", value)
+    return owner if isinstance(owner, GENERATORS) else None
+
+
+def _made(make: Callable[..., Any], scripted: Any) -> Callable[..., Any]:
+    """What makes generators, which follow the script unless they are given a seed."""
+
+    def made(*given: Any, **named: Any) -> Any:
+        return make(*given, **named) if {*given, *named.values()} - {None} else scripted
+
+    if isinstance(make, type):  # others may ask what is an instance of it
+        return type(make.__name__, (make,), {"__new__": lambda _, *given: made(*given)})
+    return made
+
+
 @contextmanager
 def scripted(script: Script, holders: Iterable[Any]) -> Iterator[Callable[[bool], None]]:
     """Let generators that the holders hold follow the script, and `random` and `numpy.random`.
 
-    A holder is a list, or an object or module with attributes; functions of `random` and
-    `numpy.random` that it holds by name follow the script, too. The function given puts them all in
-    their places, or the real ones.
+    A holder is a list, or an object or module with attributes. Methods of generators that it
+    holds by name follow the script, too, and so do generators made without a seed. The function
+    given puts them all in their places, or the real ones.
     """
     python, numpy_ = PythonDraws(script), NumpyDraws(script)
-    shared = [np.random.mtrand._rand, random._inst]
+    makers: list[tuple[Any, Any]] = [
+        (np.random.default_rng, numpy_),
+        (np.random.RandomState, numpy_),
+    ]
+    makers += [(random.Random, python), (seeding.np_random, (numpy_, 0))]
     replaced = []
-    for holder in [random, np.random, *holders]:
+    for holder in [random, np.random, seeding, *holders]:
         held: Any = holder if isinstance(holder, dict | list) else getattr(holder, "__dict__", {})
         for key, value in list(held.items() if isinstance(held, dict) else enumerate(held)):
-            owner = value if isinstance(value, GENERATORS) else getattr(value, "__self__", None)
-            if key in NOT_REPLACED or not isinstance(owner, GENERATORS):
-                continue
-            if value is owner or any(owner is known for known in shared):
+            owner = owner_of(value)
+            new: Any = next((_made(make, made) for make, made in makers if value is make), None)
+            if owner is not None and key not in NOT_REPLACED:
                 draws = python if isinstance(owner, random.Random) else numpy_
                 new = draws if value is owner else getattr(draws, value.__name__)
+            if new is not None:
                 replaced.append((held, key, (value, new)))
 
     def put(is_scripted: bool) -> None:

@@ -24,8 +24,9 @@ from rl_yardstick.envs.model_of.symbols import Drawn, Limit, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 MOST_ENTRIES = 100_000_000  # of the arrays of a model
+MOST_COMPARED = 100  # runs that came back to where a loop began
 MOST_SPANS = 1000  # times at which one action can do different things, if episodes have no end
-LEVELS = (1e-6, 0.1, 0.3, 0.5, 0.7, 0.9, 1 - 1e-6)
+LEVELS = (1e-6, *np.linspace(0.01, 0.99, 49).tolist(), 1 - 1e-6)
 
 
 class Outcome(NamedTuple):
@@ -99,7 +100,7 @@ class Tree:
         back: list[list[int]] = []
         try:
             one = self._below(choices[:first], first, back)
-            others = [self._below(path, len(path), []) for path in back[:3]]
+            others = [self._below(path, len(path), []) for path in back[:MOST_COMPARED]]
         except Stop:
             self.loops[place] = False
         except Suspect as inner:  # is judged first
@@ -207,18 +208,32 @@ class Search:
             if time and all(outcome.state < 0 for outcome in chances):
                 if any(outcome.truncated for outcome in chances):
                     self.end = min(self.end, time)
-            elif time and (time == self.end or (len(spans) > MOST_SPANS and self.end > NEVER - 2)):
+            elif time and time == self.end:
+                raise Refuted(next(iter(self.state.clocks)))
+            if len(spans) > MOST_SPANS and self.end > NEVER - 2:
                 raise Refuted(next(iter(self.state.clocks)))
             script.time = script.until + 1
         return spans
 
     def _outcomes(self, saved: bytes, action: Any) -> Chances:
-        def run(choices: list[int], root: int, loops: dict[Any, bool]) -> Outcome:
-            self.state.script.begin(choices, root, loops)
-            outcome = self._step(saved, action)
-            return self._linear(outcome, saved, action) if self.state.script.floats else outcome
+        script = self.state.script
 
-        return Tree(run, self.state.script).outcomes()
+        def run(choices: list[int], root: int, loops: dict[Any, bool]) -> Outcome:
+            script.begin(choices, root, loops)
+            try:
+                outcome = self._step(saved, action)
+            except Exception:
+                if self.state.watched:  # is it what stands in their places that fails?
+                    with self.state.plain():
+                        script.begin([choice for choice, _ in script.trace], root, loops)
+                        self._step(saved, action)
+                    raise Refuted(next(iter(self.state.watched))) from None
+                raise
+            return self._linear(outcome, saved, action) if script.floats else outcome
+
+        chances = Tree(run, script).outcomes()
+        self.state.check_constants(in_short=True)
+        return chances
 
     def _step(self, saved: bytes, action: Any) -> Outcome:
         """The outcome of one run under the script; a new state gets the next number."""
@@ -287,7 +302,8 @@ class Search:
             return f"{what} has more than {self.runs:,} outcomes{hint}"
         values = self._values(sample := self.saved[:: max(1, len(self.saved) // 500)])
         name = max(values, key=lambda name: len(values[name]), default="state")
-        return f"`{name}` has {len(values[name])} values in {len(sample)} of them"
+        many = f"`{name}` has {len(values[name])} values in {len(sample)} of them"
+        return f"{many} (optimum --ignore {name} if it changes nothing)"
 
     def state_now(self, observation: Any, time: int) -> int | None:
         """The number in the model of the state that the environment is in; None if unknown."""
@@ -308,6 +324,9 @@ class Search:
     def _count_times(self) -> int:
         """At how many times the states of the model are told apart; 1 if time changes nothing."""
         for (_, usual), *later in (spans for row in self.rows for spans in row if spans):
+            _, last = later[-1] if later else (0, usual)
+            if self.horizon is not None and any(outcome.state >= 0 for outcome in last):
+                raise Refuted(next(iter(self.state.clocks)))  # the limit is not that of all states
             if any(first < self.end or not _alike(usual, chances) for first, chances in later):
                 if self.horizon is None:
                     raise Refuted(next(iter(self.state.clocks)))

@@ -14,15 +14,18 @@ from __future__ import annotations
 
 import enum
 import io
+import itertools
 import pickle
 import types
-from collections.abc import Hashable, Iterable
+from collections import deque
+from collections.abc import Hashable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from rl_yardstick.envs.model_of.draws import GENERATORS, Script
+from rl_yardstick.envs.model_of.draws import GENERATORS, Script, owner_of
 from rl_yardstick.envs.model_of.symbols import Stop, Symbol
 
 Env = gym.Env[Any, Any]
@@ -31,14 +34,14 @@ Saved = list[dict[str, Any]]  # attributes of each layer
 
 TRANSPARENT = {"HumanRendering", "Monitor", "OrderEnforcing", "PassiveEnvChecker", "TimeLimit"}
 TRANSPARENT |= {"RecordEpisodeStatistics", "RecordVideo", "RenderCollection"}
-NO_STATE = {"_cached_spec", "_np_random_seed", "action_space", "env", "metadata"}
+NO_STATE = {"_cached_spec", "_np_random_seed", "action_space", "metadata"}
 NO_STATE |= {"observation_space", "render_mode", "spec"}
 PLAYED = 50  # steps of each of the two episodes that are played first
 SIMPLE = (int, float, str, bytes, complex, types.NoneType, np.generic)
 ATOMS = frozenset({*SIMPLE, bool})
 NUMBERS = (np.generic, Symbol)
 BY_IDENTITY: tuple[Any, ...] = (types.FunctionType, types.BuiltinFunctionType, types.ModuleType)
-BY_IDENTITY += (type, np.dtype, np.ufunc, gym.Space, enum.Enum, gym.Env, *GENERATORS)
+BY_IDENTITY += (type, np.dtype, np.ufunc, gym.Space, enum.Enum, *GENERATORS)
 
 
 class Refuted(BaseException):
@@ -67,11 +70,29 @@ class Clock(Symbol):
         self.script.until = self.script.time
         return self.scale * self.script.time + self.shift
 
+    def over(self, divisor: Any) -> Any:
+        if (self.scale, type(self.shift), type(divisor)) != (1, int, int) or divisor < 1:
+            return self.now() // divisor
+        script, value = self.script, self.script.time + self.shift
+        script.until = min(script.until, script.time + divisor - 1 - value % divisor)
+        return value // divisor
+
     def below(self, cut: float, closed: bool) -> bool:
         last = np.floor(cut) if closed else np.ceil(cut) - 1  # the last time below
         if is_below := bool(self.script.time <= last):
             self.script.until = int(min(last, self.script.until))
         return is_below
+
+
+def short(value: Any, depth: int = 2) -> Any:
+    """What changes with most changes of an object in place, quickly."""
+    if isinstance(value, np.ndarray) or not depth:
+        return value.tobytes() if isinstance(value, np.ndarray) else id(value)
+    if isinstance(value, dict):
+        value = value.values()
+    elif not isinstance(value, list | tuple | set | deque):
+        value = getattr(value, "__dict__", {}).values()
+    return [short(part, depth - 1) for part in value]
 
 
 class ByValue(pickle.Pickler):
@@ -121,13 +142,15 @@ class State:
             env = env.env
         self.layers.append(env)
         self.original = [(layer, type(layer), dict(vars(layer))) for layer in self.layers]
-        self.script, self.no_state = script, NO_STATE | set(ignored)
+        self.script, self.ignored, self.no_state = script, ignored, NO_STATE | set(ignored)
         self.used: set[Place] = set()  # guesses that were wrong
         self.clocks: dict[Place, int] = {}  # with their values at the start of an episode
         self.watched: dict[Place, Any] = {}  # what was last written to ghosts and clocks
         self.constants: dict[Place, Hashable] = {}  # by value
         self.fixed: Saved = []  # the constants of each layer, and what is no state
         self.kept: dict[int, Any] = {}  # objects that are saved by reference, by id
+        self.in_short: list[tuple[Any, Any]] = []  # constants that can change in place
+        self.is_plain = False  # whether watched attributes have values
 
     def restore_original(self, without_transparent: bool) -> None:
         """Give the layers the classes and attributes that they had."""
@@ -145,7 +168,8 @@ class State:
             (i, name): value
             for i, layer in enumerate(self.layers)
             for name, value in vars(layer).items()
-            if name not in self.no_state and not isinstance(value, GENERATORS)
+            if name not in self.no_state and owner_of(value) is None
+            if layer is self.layers[-1] or name != "env"
         }
 
     def play(self, actions: list[Any]) -> None:
@@ -174,16 +198,25 @@ class State:
         self.counting = dict(set.intersection(*counts))
         self.left_alone = dict(set.intersection(*values))
         self.start = [dict(vars(layer)) for layer in self.layers]
+        arrays = [(n, v) for (_, n), v in self.attributes().items() if isinstance(v, np.ndarray)]
+        for (one, a), (other, b) in itertools.combinations(arrays, 2):
+            if a is not b and np.may_share_memory(a, b):
+                raise Stop(f"`{one}` and `{other}` share their numbers: one is a view")
+        for name in self.ignored:
+            if name not in {name for layer in self.layers for name in vars(layer)}:
+                raise Stop(f"there is no attribute `{name}` to ignore")
 
     def guess(self) -> None:
         """Guess what is constant, never read, or a clock, but for the guesses that were wrong."""
         for (layer, kind, _), held in zip(self.original, self.start, strict=True):
             layer.__class__ = kind
-            vars(layer).update((k, v) for k, v in held.items() if not isinstance(v, GENERATORS))
+            vars(layer).update((k, v) for k, v in held.items() if owner_of(v) is None)
         guessed = {p: value for p, value in self.attributes().items() if p not in self.used}
         self.constants = {p: self.left_alone[p] for p in guessed if p in self.left_alone}
         self.kept = self.parts([guessed[place] for place in self.constants])
         self.kept |= {id(layer): layer for layer in self.layers}
+        held_fast = [guessed[place] for place in self.constants]
+        self.in_short = [(v, short(v)) for v in held_fast if not isinstance(v, SIMPLE)]
         self.watched = {p: value for p, value in guessed.items() if p not in self.constants}
         self.clocks = {p: self.counting[p] for p in self.watched if p in self.counting}
         self.fixed = []
@@ -201,7 +234,7 @@ class State:
 
         def read(_: Env) -> Any:
             value = self.watched[place]
-            if place in self.clocks:
+            if place in self.clocks or self.is_plain:
                 return value
             if isinstance(value, Ghost | int | float | list | np.number):
                 return Ghost(self.script, Refuted(place))
@@ -219,8 +252,19 @@ class State:
             if not right:
                 raise Refuted(place)
 
-    def check_constants(self) -> None:
+    @contextmanager
+    def plain(self) -> Iterator[None]:
+        """Give watched attributes values: to clocks the script's time."""
+        self.is_plain = True
+        try:
+            yield
+        finally:
+            self.is_plain = False
+
+    def check_constants(self, in_short: bool = False) -> None:
         """Constants must not have changed in place."""
+        if in_short and all(known == short(value) for value, known in self.in_short):
+            return
         kept, self.kept = self.kept, {}
         now = {(i, name): self.by_value(self.fixed[i][name]) for i, name in self.constants}
         self.kept = kept
@@ -286,7 +330,8 @@ class State:
                 del held[name]
             held.update(values)
         for place, start in self.clocks.items():
-            self.watched[place] = Clock(self.script, None, 1, start)
+            clock = Clock(self.script, None, 1, start)
+            self.watched[place] = clock.now() if self.is_plain else clock
 
     def by_value(self, value: Any) -> Hashable:
         """Something hashable that is equal for equal values."""

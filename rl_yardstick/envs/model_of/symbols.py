@@ -74,6 +74,14 @@ class Symbol(NDArrayOperatorsMixin):
     def __bool__(self) -> bool:
         return bool(self != 0)
 
+    def over(self, divisor: Any) -> Any:
+        """The whole part of its quotient."""
+        return float(math.floor(self / divisor))
+
+    def rint(self, decimals: int = 0, out: None = None) -> Any:
+        """As `numpy.round` calls it, for arrays; for numbers, it calls ``round``."""
+        return float(self.__round__(decimals))  # type: ignore[attr-defined]
+
     def __reduce_ex__(self, protocol: Any) -> Any:
         return self.now().__reduce_ex__(protocol)
 
@@ -84,6 +92,8 @@ def _value_method(name: str) -> Callable[..., Any]:
 
 for _name in ["int", "float", "index", "hash", "str", "format", "round", "floor", "ceil", "trunc"]:
     setattr(Symbol, f"__{_name}__", _value_method(f"__{_name}__"))
+
+setattr(Symbol, "round", Symbol.rint)  # noqa: B010
 
 
 def _add(a: Any, b: Any, sign: int = 1) -> Any:
@@ -132,7 +142,8 @@ RULES: dict[np.ufunc, Callable[..., Any]] = {
     np.minimum: lambda a, b: a if a < b else b,
     np.floor: lambda a: float(math.floor(a)),
     np.ceil: lambda a: float(math.ceil(a)),
-    np.floor_divide: lambda a, b: float(math.floor(a / b)),
+    np.rint: lambda a: a.rint(),
+    np.floor_divide: lambda a, b: a // b.now() if isinstance(b, Symbol) else a.over(b),
 }
 
 
