@@ -27,7 +27,7 @@ from rl_yardstick.agents.common.exploration import (
     make_probabilities,
 )
 from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import by_type
 from rl_yardstick.agents.compiled.references import generator_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats
@@ -38,7 +38,7 @@ from rl_yardstick.mdp.transition_model import Floats
 @by_type
 def upper_bound(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float:
     """The bound of an arm after ``count`` of ``pulls`` pulls."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @inlined

@@ -9,13 +9,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from rl_yardstick.agents.common.callbacks import (
+    BlockCallback,
     EpisodeBudget,
     Horizon,
     horizon,
     members,
     pass_over,
     unknown_callbacks,
-    wants_position,
 )
 from rl_yardstick.agents.compiled.env_states import (
     COMPENSATED_SUM,
@@ -94,13 +94,15 @@ class CompiledEngine:
     def run(self, total_timesteps: int) -> None:
         """Train until ``num_timesteps`` reaches ``total_timesteps`` or a callback stops it."""
         try:
-            while not self._is_over(total_timesteps) and self._run_block(total_timesteps):
+            while self._steps_left(total_timesteps) > 0 and self._run_block(total_timesteps):
                 pass
         finally:
             self._write()
 
-    def _is_over(self, total_timesteps: int) -> bool:
-        return bool(self.agent.num_timesteps >= total_timesteps)
+    def _steps_left(self, total_timesteps: int) -> int:
+        """Steps of every environment until the training is over."""
+        left: int = total_timesteps - self.agent.num_timesteps
+        return -(-left // int(self.agent.n_envs))
 
     def _run_block(self, total_timesteps: int) -> bool:
         """Train for a block of steps; False once a callback asks to stop."""
@@ -120,7 +122,8 @@ class CompiledEngine:
 
     def _begin_block(self) -> None:
         """Call the callbacks, with environments up to date if one of them asks for that."""
-        if wants_position(self.callback):
+        known = (m for m in members(self.callback) if isinstance(m, BlockCallback))
+        if any(member.wants_position() for member in known):
             self._write()
             self.callback.on_rollout_start()
             self._read()
@@ -129,9 +132,8 @@ class CompiledEngine:
 
     def _limit(self, total_timesteps: int) -> Horizon:
         """The number of steps and episodes until the block must end."""
-        ahead = horizon(self.callback)
-        steps_left = -(-(total_timesteps - self.agent.num_timesteps) // self.agent.n_envs)
-        return Horizon(min(ahead.calls, steps_left, self.block_steps), ahead.episodes)
+        ahead, left = horizon(self.callback), self._steps_left(total_timesteps)
+        return Horizon(min(ahead.calls, left, self.block_steps), ahead.episodes)
 
     def _step(self, limit: Horizon) -> int:
         """Act and learn in compiled code, but for the last step; returns the number of steps."""

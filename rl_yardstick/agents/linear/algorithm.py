@@ -29,7 +29,7 @@ from rl_yardstick.agents.common.settings import (
 )
 from rl_yardstick.agents.compiled.engine import EngineChoice
 from rl_yardstick.agents.compiled.env_states import BEFORE, observe
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import by_type
 from rl_yardstick.agents.compiled.references import handles_of
 from rl_yardstick.agents.compiled.worlds import UNDECIDED, env_dtype
 from rl_yardstick.agents.tabular.workspace import Workspace, WorkspaceAlgorithm
@@ -242,7 +242,7 @@ class HandedVectors(NamedTuple):
 @by_type
 def choose_by_sums(agent: LinearAgent, progress: Any) -> int:
     """An action by ``agent.room.values``."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @called

@@ -44,7 +44,6 @@ from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.references import handles_of
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.tabular.updates import (
-    MaskedTables,
     Room,
     Tables,
     TabularAgent,
@@ -297,9 +296,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         n_draws = draws_per_choice(self.strategy, n_actions)
         return TabularAgent(
             self.settings()[0],
-            MaskedTables(values, counts, policy.masks)
-            if self.mask_actions
-            else Tables(values, counts),
+            Tables(values, counts, policy.masks),
             Room(np.empty(n_actions), np.arange(n_actions), np.empty(n_draws)),
             handles_of([rng])[0],
             self._memory_in_use(),

@@ -11,13 +11,12 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
+from rl_yardstick.agents.compiled.loop import by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.agents.tabular.q_learning_and_sarsa import QLearning
 from rl_yardstick.agents.tabular.updates import (
     TabularAgent,
-    action_at,
     best_value,
     learning_in_turn,
     room_at,
@@ -147,7 +146,7 @@ class ModelKeeper(TabularAlgorithm):
 @by_type
 def remember(agent: TabularAgent, env: Any) -> None:
     """Update the model with the environment's last step."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @by_type_or_this
@@ -256,7 +255,7 @@ def remember_outcome_and_time(agent: TabularAgent, env: Any) -> None:
     if seen == 0:
         room = room_at(agent.tables, env.obs, agent.room)
         for k in range(len(room.values)):
-            add_pair(model, env.obs, action_at(agent.tables, room, k))
+            add_pair(model, env.obs, room.actions[k])
     note_outcome(model, env)
     model.time[0] += 1
     model.tried_at[env.obs, env.action] = model.time[0]
