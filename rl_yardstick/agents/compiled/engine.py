@@ -27,7 +27,6 @@ from rl_yardstick.agents.compiled.env_states import (
 )
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
 from rl_yardstick.agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
-from rl_yardstick.agents.compiled.references import handles_of
 from rl_yardstick.agents.compiled.worlds import (
     EPISODE,
     PROGRESS,
@@ -61,9 +60,6 @@ class CompiledEngine:
         self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
         self.states = EnvStates(agent.env, self.world, self.seen)
         self.envs = self.states.records
-        # Handles do not keep their generators alive.
-        self.generators = [env.unwrapped.np_random for env in agent.env.envs]
-        self.handles = handles_of(self.generators)
         self.progress = np.zeros(1, dtype=PROGRESS)
         self.log = EpisodeLog(
             np.zeros(self.block_steps * agent.n_envs, dtype=EPISODE),
@@ -82,14 +78,7 @@ class CompiledEngine:
         for name, schedule in agent.schedules().items():
             progress[f"{name}_schedule"] = compiled_schedule(schedule)
             progress[name] = schedule(agent._current_progress_remaining)
-        self._take_generators()
         return self.learner
-
-    def _take_generators(self) -> None:
-        """Make new handles, because a callback may have reseeded the environments."""
-        generators = [env.unwrapped.np_random for env in self.agent.env.envs]
-        if any(a is not b for a, b in zip(generators, self.generators, strict=True)):
-            self.generators, self.handles = generators, handles_of(generators)
 
     def run(self, total_timesteps: int) -> None:
         """Train until ``num_timesteps`` reaches ``total_timesteps`` or a callback stops it."""
@@ -137,11 +126,12 @@ class CompiledEngine:
 
     def _step(self, limit: Horizon) -> int:
         """Act and learn in compiled code, but for the last step; returns the number of steps."""
+        self.states.take_generators()  # a callback may have reseeded the environments
         return run_block(
             self.world,
             self._learner(),
             self.envs,
-            self.handles,
+            self.states.handles,
             self.progress[0],
             self.log,
             limit.calls,
@@ -364,13 +354,10 @@ def play_episodes(agent: Any, copy: CompiledCopy, n_episodes: int) -> Episodes:
     env, world, seen = copy
     n_envs, player = env.num_envs, agent.greedy_player(seen)
     wanted = (n_episodes + np.arange(n_envs)) // n_envs
-    states = EnvStates(env, world, seen)
     observations = env.reset()
+    states, progress = EnvStates(env, world, seen), np.zeros(1, dtype=PROGRESS)
     states.read()
     states.take_observations(observations)
-    # Handles do not keep their generators alive.
-    generators = [env.unwrapped.np_random for env in states.vec_env.envs]
-    handles, progress = handles_of(generators), np.zeros(1, dtype=PROGRESS)
     log = EpisodeLog(
         np.zeros(STEPS_AT_ONCE * n_envs, dtype=EPISODE), np.empty((STEPS_AT_ONCE, n_envs))
     )
@@ -381,7 +368,8 @@ def play_episodes(agent: Any, copy: CompiledCopy, n_episodes: int) -> Episodes:
         if (n_missing := int((wanted - n_ended).clip(0).sum())) == 0:
             break
         limits = STEPS_AT_ONCE, n_missing, COMPENSATED_SUM
-        n_steps = run_block(world, player, states.records, handles, progress[0], log, *limits)
+        told = world, player, states.records, states.handles, progress[0], log
+        n_steps = run_block(*told, *limits)
         learn_from_last_step(player, states.records, progress[0])
         if hasattr(player, "check"):
             player.check()

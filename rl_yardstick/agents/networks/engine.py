@@ -302,7 +302,6 @@ class NetworkEngine(CompiledEngine):
         for name, schedule in self.agent.schedules().items():
             self.progress[0][f"{name}_schedule"] = compiled_schedule(schedule)
         self.training.read_settings()
-        self._take_generators()
         return self.in_loop
 
     def _steps_left(self, total_timesteps: int) -> int:

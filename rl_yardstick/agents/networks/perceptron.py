@@ -24,7 +24,7 @@ from rl_yardstick.mdp.transition_model import Ints
 Singles = NDArray[np.float32]
 
 SINGLE, AS_IT_IS, TRANSPOSED = map(ord, "sNT")
-_gemm: Any = _BLAS.numba_xxgemm(types.float32)
+_gemm: Any = _BLAS.numba_xxgemm(types.float32)  # type: ignore[no-untyped-call]
 # The factors of the product, and of the earlier content of its array.
 _FACTOR, _ADDED = np.ones(1, np.float32), np.zeros(1, np.float32)
 
@@ -36,7 +36,7 @@ def one_thread() -> AbstractContextManager[Any]:
 
     The matrices are too small for several threads, whose number would change the last bits.
     """
-    ensure_blas()
+    ensure_blas()  # type: ignore[no-untyped-call]
     limited: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
     return limited
 

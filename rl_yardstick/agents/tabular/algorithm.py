@@ -36,7 +36,6 @@ from rl_yardstick.agents.common.settings import (
     POSITIVE,
     SHARE,
     ExplorationDecay,
-    TieBreaking,
     check_space,
 )
 from rl_yardstick.agents.compiled.engine import EngineChoice, Plan
@@ -122,7 +121,6 @@ class QTablePolicy(MaskBufferPolicy):
         return np.where(masks | ~masks.any(axis=1, keepdims=True), values, -np.inf)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        """The first of the best allowed actions for each observation, shape (n,)."""
         obs = numbers_in(self.observation_space, observation).reshape(-1)
         return th.from_numpy(self.allowed_values(obs).argmax(axis=1))
 
@@ -225,12 +223,10 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         exploration_decay: ExplorationDecay = "linear",
         temperature: float | Schedule = 1.0,
         noise_std: float | Schedule = 1.0,
-        tie_breaking: TieBreaking = "random",
         initial_q: float = 0.0,
         initial_q_std: float = 0.0,
         skip_terminal_update: bool = False,
         engine: EngineChoice = "auto",
-        policy_kwargs: dict[str, Any] | None = None,
         mask_actions: bool = False,
         **kwargs: Any,
     ) -> None:
@@ -250,7 +246,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         self.masks_are_known = False
         self.last_steps: NDArray[np.void] | None = None
         self._infos: list[dict[str, Any]] = []
-        super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
+        super().__init__(policy, env, learning_rate, **kwargs)
 
     def _check_arguments(self) -> None:
         if self.mask_actions and self.env is not None:

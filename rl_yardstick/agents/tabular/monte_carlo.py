@@ -98,9 +98,6 @@ class RecordAlgorithm(EpisodicAlgorithm):
         )
 
 
-# The policy of off-policy Monte Carlo control: action values, and the sums of their weights.
-
-
 class ImportanceTablePolicy(QTablePolicy):
     """Greedy in a table of action values, each the weighted mean of returns."""
 
@@ -110,9 +107,6 @@ class ImportanceTablePolicy(QTablePolicy):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.register_buffer("weights", th.zeros_like(self.q_tables))
-
-
-# On-policy Monte Carlo control.
 
 
 @inlined
@@ -162,8 +156,6 @@ class MonteCarlo(RecordAlgorithm):
         room = np.empty(self.policy.q_tables.shape[1:], dtype=np.int64)
         return self._memory._replace(of_entries=room)
 
-
-# Off-policy Monte Carlo control.
 
 # With larger weights their sum could become infinite.
 LARGEST_WEIGHT = 1e150

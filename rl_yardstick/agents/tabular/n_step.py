@@ -168,17 +168,12 @@ class WindowAlgorithm(EpisodicAlgorithm):
         return Windows(states, actions, np.zeros(shape), oldest, lengths)
 
 
-# n-step SARSA.
-
-
 class NStepSARSA(WindowAlgorithm):
     """n-step SARSA (Sutton and Barto, section 7.2); with one step it is SARSA."""
 
     commit = commit_to_next_action
     next_value = committed_value
 
-
-# n-step tree backup.
 
 TargetPolicy = Literal["exploring", "greedy"]
 GREEDY = 1
@@ -374,9 +369,6 @@ class TraceAlgorithm(EpisodicAlgorithm):
         return Traces(states, actions, np.zeros(shape), lengths, np.zeros(self.n_envs))
 
 
-# SARSA(lambda).
-
-
 class SARSALambda(TraceAlgorithm):
     """SARSA(lambda) (Rummery and Niranjan, 1994; Sutton and Barto, section 12.7).
 
@@ -385,9 +377,6 @@ class SARSALambda(TraceAlgorithm):
 
     commit = commit_to_next_action
     next_value = committed_value
-
-
-# Watkins's Q(lambda).
 
 
 @inlined
