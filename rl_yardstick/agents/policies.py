@@ -218,9 +218,6 @@ def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:
     return ""
 
 
-# --- values or probabilities of actions -----------------------------------------------------------
-
-
 def action_figures(agent: BaseAlgorithm, observations: Any) -> tuple[str, Floats] | None:
     """The agent's figures for each action at the observation of one environment, or None.
 

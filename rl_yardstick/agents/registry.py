@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -126,8 +126,6 @@ def is_bandit(env: gym.Env[Any, Any]) -> bool:
     return isinstance(env.unwrapped, Bandit)
 
 
-# The agents: names, classes and supported spaces.
-
 DISCRETE = ("Discrete",)
 LINEAR_INPUTS = ("Box", "Discrete")
 NETWORK_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict")
@@ -140,13 +138,17 @@ VECTOR_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 
 
 def _family(
-    prefix: str, observations: tuple[str, ...], actions: tuple[str, ...], **fields: Any
+    prefix: str,
+    observations: tuple[str, ...],
+    actions: tuple[str, ...],
+    by: str = "",
+    **fields: Any,
 ) -> Callable[..., AlgorithmEntry]:
-    """A function that makes the entries of similar agents."""
+    """A function that makes the entries of similar agents, whose summaries end with ``by``."""
 
     def entry(place: str, summary: str, **own: Any) -> AlgorithmEntry:
         spaces_of_all = {"observations": observations, "actions": actions}
-        return AlgorithmEntry(prefix + place, summary, **{**spaces_of_all, **fields, **own})
+        return AlgorithmEntry(prefix + place, summary + by, **{**spaces_of_all, **fields, **own})
 
     return entry
 
@@ -158,9 +160,10 @@ _tiled = _family(f"{OURS}linear.", LINEAR_INPUTS, DISCRETE, engines=TABLE_ENGINE
 _network = _family(f"{OURS}library:", NETWORK_INPUTS, DISCRETE, engines=LIBRARY_ENGINES)
 _continuous = _family("stable_baselines3:", NETWORK_INPUTS, CONTINUOUS, engines=LIBRARY_ENGINES[:1])
 _contrib = _family(
-    "",
+    "sb3_contrib:",
     NETWORK_INPUTS,
     DISCRETE,
+    by=" (sb3-contrib)",
     package="sb3_contrib",
     extra="contrib",
     engines=LIBRARY_ENGINES[:1],
@@ -168,7 +171,13 @@ _contrib = _family(
 _planning = _family(f"{OURS}planning:", DISCRETE, DISCRETE)
 _bandit = _family(f"{OURS}bandits.", DISCRETE, DISCRETE, for_bandits=True)
 _mabwiser = _family(
-    f"{OURS}mabwiser:", DISCRETE, DISCRETE, for_bandits=True, package="mabwiser", extra="bandits"
+    f"{OURS}mabwiser:",
+    DISCRETE,
+    DISCRETE,
+    by=" (MABWiser)",
+    for_bandits=True,
+    package="mabwiser",
+    extra="bandits",
 )
 
 
@@ -220,38 +229,29 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "sac": _continuous("SAC", "soft actor-critic (Stable-Baselines3)"),
     "td3": _continuous("TD3", "twin delayed policy gradient (Stable-Baselines3)"),
     "ddpg": _continuous("DDPG", "deep deterministic policy gradient (Stable-Baselines3)"),
-    "qrdqn": _contrib("sb3_contrib:QRDQN", "quantile-regression DQN (sb3-contrib)"),
-    "tqc": _contrib(
-        "sb3_contrib:TQC", "truncated quantile critics (sb3-contrib)", actions=CONTINUOUS
-    ),
+    "qrdqn": _contrib("QRDQN", "quantile-regression DQN"),
+    "tqc": _contrib("TQC", "truncated quantile critics", actions=CONTINUOUS),
     "crossq": _contrib(
-        "sb3_contrib:CrossQ",
-        "SAC without target networks (sb3-contrib)",
-        observations=VECTOR_INPUTS,
-        actions=CONTINUOUS,
+        "CrossQ", "SAC without target networks", observations=VECTOR_INPUTS, actions=CONTINUOUS
     ),
-    "trpo": _contrib(
-        "sb3_contrib:TRPO",
-        "trust-region policy optimisation (sb3-contrib)",
-        actions=POLICY_GRADIENT_OUTPUTS,
-    ),
-    "ars": _contrib(
-        f"{OURS}random_search:ARS",
-        "augmented random search (sb3-contrib)",
+    "trpo": _contrib("TRPO", "trust-region policy optimisation", actions=POLICY_GRADIENT_OUTPUTS),
+    "ars": replace(
+        _contrib("ARS", "augmented random search"),
+        entry_point=f"{OURS}random_search:ARS",
         observations=VECTOR_INPUTS,
         actions=(*CONTINUOUS, *DISCRETE),
     ),
     "ppo_lstm": _contrib(
-        "sb3_contrib:RecurrentPPO",
-        "PPO with a memory (sb3-contrib)",
+        "RecurrentPPO",
+        "PPO with a memory",
         # sb3-contrib 2.9 fails on the other spaces.
         observations=("Box", "Discrete", "MultiBinary", "Dict"),
         actions=("Box", "Discrete", "MultiDiscrete"),
         has_memory=True,
     ),
     "ppo_mask": _contrib(
-        "sb3_contrib:MaskablePPO",
-        "PPO that is told which actions are valid (sb3-contrib)",
+        "MaskablePPO",
+        "PPO that is told which actions are valid",
         actions=("Discrete", "MultiDiscrete", "MultiBinary"),
         needs_masks=True,
     ),
@@ -295,13 +295,11 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         "contextual bandit: linear, epsilon-greedy",
         observations=LINEAR_INPUTS,
     ),
-    "mabwiser_epsilon_greedy": _mabwiser(
-        "MABWiserEpsilonGreedy", "bandit: epsilon-greedy (MABWiser)"
-    ),
-    "mabwiser_ucb1": _mabwiser("MABWiserUCB1", "bandit: UCB1 (MABWiser)"),
-    "mabwiser_thompson": _mabwiser("MABWiserThompson", "bandit: Thompson sampling (MABWiser)"),
+    "mabwiser_epsilon_greedy": _mabwiser("MABWiserEpsilonGreedy", "bandit: epsilon-greedy"),
+    "mabwiser_ucb1": _mabwiser("MABWiserUCB1", "bandit: UCB1"),
+    "mabwiser_thompson": _mabwiser("MABWiserThompson", "bandit: Thompson sampling"),
     "mabwiser_linucb": _mabwiser(
-        "MABWiserLinUCB", "contextual bandit: LinUCB (MABWiser)", observations=LINEAR_INPUTS
+        "MABWiserLinUCB", "contextual bandit: LinUCB", observations=LINEAR_INPUTS
     ),
 }
 

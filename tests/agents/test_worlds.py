@@ -69,7 +69,8 @@ def random_states(n):
     return rng.uniform(-1, 1, (n, 4)) * spread
 
 
-def records_of(kind, names, states):
+def records_of(names, states):
+    kind = worlds.env_dtype(*((name, np.float64) for name in names))
     records = np.zeros(len(states), dtype=kind)
     for name, column in zip(names, states.T, strict=True):
         records[name] = column
@@ -79,13 +80,13 @@ def records_of(kind, names, states):
 @pytest.mark.parametrize("case", PHYSICS)
 def test_steps_equal_gymnasiums(case):
     env, rng = PHYSICS[case](), np.random.default_rng(0)
-    kind, names, states = worlds.CART_POLE_ENV, worlds.STATE, random_states(20_000)
+    names, states = worlds.STATE, random_states(20_000)
     if "car" in case:
-        kind, names = worlds.MOUNTAIN_CAR_ENV, worlds.CAR_STATE
+        names = worlds.CAR_STATE
         states = rng.uniform([-1.1, -0.05], [0.5, 0.05], (20_000, 2))
         states[::5, 0] = rng.uniform(-1.1, -1.08, len(states[::5]))  # against the wall
         states[1::5, 0] = rng.uniform(0.35, 0.5, len(states[1::5]))  # before the flag
-    records = records_of(kind, names, states)
+    records = records_of(names, states)
     records["action"] = rng.integers(0, env.action_space.n, len(states))
     terminated, base, ended = np.empty(len(states), dtype=np.bool_), env.unwrapped, []
     expected = np.empty_like(states)
@@ -118,7 +119,7 @@ def test_bins_equal_the_wrappers(kwargs, dims):
     extremes = np.repeat(extremes, 4).reshape(-1, 4)
     states = np.concatenate([random_states(10_000), uniform, extremes])
     indices = np.empty(len(states), dtype=np.int64)
-    bins_of(records_of(worlds.CART_POLE_ENV, worlds.STATE, states), world_of(env), indices)
+    bins_of(records_of(worlds.STATE, states), world_of(env), indices)
     seen = states.astype(np.float32)
     assert indices.tolist() == [env.observation(state) for state in seen]
     np.testing.assert_array_equal(indices, env.map_observations(seen))
@@ -149,7 +150,7 @@ plain = partial(reduce, operator.add)
 @given(values=st.lists(st.floats(-1e12, 1e12), max_size=40))
 def test_sums_by_either_rule_and_as_this_python_does(values):
     for compensated, add_up in ((True, compensated_sum), (False, plain), (COMPENSATED_SUM, sum)):
-        sums, record = np.empty(len(values)), np.zeros(1, dtype=worlds.CART_POLE_ENV)[0]
+        sums, record = np.empty(len(values)), np.zeros(1, dtype=worlds.ENV)[0]
         running_sums(record, np.array(values), compensated, sums)
         assert sums.tolist() == [add_up(values[: i + 1]) for i in range(len(values))]
 

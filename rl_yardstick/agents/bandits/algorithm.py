@@ -35,8 +35,6 @@ from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, S
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 
-# The base of the policies of bandit agents: they pull the arm with the highest score.
-
 
 class ArmPolicy(MaskBufferPolicy):
     """Pulls the first arm of the highest score, among the allowed ones if masks are kept."""
@@ -62,7 +60,6 @@ class ArmPolicy(MaskBufferPolicy):
         return np.array(best, dtype=np.int64)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        """The first of the best arms for each observation, shape (n,)."""
         observations = observation.numpy()
         if len(self.masks):
             rows = observations.astype(np.int64).reshape(-1)

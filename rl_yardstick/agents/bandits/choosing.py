@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl_yardstick.agents.common.exploration import greedy_action
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
+from rl_yardstick.agents.compiled.loop import by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import generator_of
 from rl_yardstick.machine_code.compiling import inlined, kernel
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
@@ -62,13 +62,13 @@ class ScoreAgent(NamedTuple):
 @by_type
 def context_row(agent: Any, env: Any) -> int:
     """The agent's row for the present context of the environment."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @by_type
 def choose_arm(agent: Any, row: int, progress: Any) -> int:
     """An arm in the context ``row``."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @by_type_or_this
@@ -87,7 +87,7 @@ def choose_allowed(
     agent: Any, row: int, mask: Bools, room: AllowedRoom, progress: Any
 ) -> tuple[int, float]:
     """One of the arms of ``mask`` in the context ``row``, and the probability of the choice."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @inlined

@@ -30,8 +30,6 @@ from rl_yardstick.agents.compiled.references import generator_of, handles_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
-# The policy of agents with a linear model of each arm's reward: their knowledge, in buffers.
-
 
 class LinearBanditPolicy(ArmPolicy):
     """Pulls the arm of the highest predicted reward."""
@@ -80,9 +78,6 @@ def features(space: spaces.Space[Any], observations: NDArray[Any]) -> Floats:
         return np.asarray(np.eye(n_features)[observations.astype(np.int64).reshape(-1)])
     vectors: Floats = observations.astype(np.float64).reshape(-1, n_features)
     return vectors
-
-
-# Contextual agents with a linear model of each arm's reward.
 
 
 @inlined

@@ -27,18 +27,16 @@ from rl_yardstick.agents.common.exploration import (
     make_probabilities,
 )
 from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import by_type
 from rl_yardstick.agents.compiled.references import generator_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats
-
-# The base of agents that pull the arm of the highest upper confidence bound.
 
 
 @by_type
 def upper_bound(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float:
     """The bound of an arm after ``count`` of ``pulls`` pulls."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @inlined
@@ -71,8 +69,6 @@ class UpperBoundBandit(TableBandit):
     learn_from_reward = average_rewards
     initial_score = -math.inf  # below that of any arm that was tried
 
-
-# Upper confidence bounds.
 
 Variant = Literal["ucb1", "sutton_barto"]
 SUTTON_BARTO = 1
@@ -118,8 +114,6 @@ class UCB(UpperBoundBandit):
         default = 2.0 if self.variant == "sutton_barto" else 1.0
         return default if self.c is None else self.c
 
-
-# Upper confidence bounds by the divergence of Bernoulli distributions.
 
 MAX_NEWTON_STEPS = 60
 PRECISION = 1e-13
@@ -185,9 +179,6 @@ class KLUCB(UpperBoundBandit):
     def __init__(self, *args: Any, c: float = 0.0, **kwargs: Any) -> None:
         self.c = c
         super().__init__(*args, **kwargs)
-
-
-# Thompson sampling.
 
 
 Likelihood = Literal["bernoulli", "gaussian"]
@@ -319,9 +310,6 @@ class Thompson(TableBandit):
         return np.stack([weighted / precision, precision**-0.5], axis=-1)
 
 
-# The base of agents whose scores are preferences or log-weights instead of estimates of rewards.
-
-
 @inlined
 def softmax(tables: ScoreTables, row: int, probabilities: Floats) -> None:
     """Fill in the probability of each arm, proportional to exp(score)."""
@@ -343,9 +331,6 @@ class PreferenceBandit(TableBandit):
         """The probabilities of arms now at each of n observations, shape (n, arms)."""
         scores = self.policy.judged(observations)
         return action_probabilities(BOLTZMANN, scores, 1.0, random_ties=False)
-
-
-# The gradient bandit.
 
 
 @inlined
@@ -398,9 +383,6 @@ class GradientBandit(PreferenceBandit):
     ) -> None:
         self.baseline = baseline
         super().__init__(*args, learning_rate=learning_rate, **kwargs)
-
-
-# Exponential weights against an adversary.
 
 
 @inlined

@@ -194,9 +194,6 @@ def bandit_model(env: gym.Env[Any, Any]) -> BanditModel:
     )
 
 
-# The results of many independent runs of one agent on one bandit.
-
-
 @dataclass(frozen=True)
 class BatchResult:
     """A row for each run, a column for each pull."""
@@ -362,14 +359,7 @@ class Runs:
 
     def result(self) -> BatchResult:
         """The results of all runs."""
-        n_contexts = self.env.unwrapped.n_contexts  # type: ignore[attr-defined]
-        estimates = coefficients = posteriors = None
-        if isinstance(self.agent, LinearBanditAgent):
-            coefficients = self.known["coefficients"]
-            if n_contexts > 0:
-                estimates = coefficients.transpose(0, 2, 1)
-        else:
-            estimates = self.agent.estimates(ScoreTables(**self.known))
+        n_contexts, posteriors = self.env.unwrapped.n_contexts, None  # type: ignore[attr-defined]
         if isinstance(self.agent, Thompson):
             posteriors = self.agent.posterior(ScoreTables(**self.kept))
         return BatchResult(
@@ -378,14 +368,10 @@ class Runs:
             self.rewards,
             self.regrets,
             self.contexts if n_contexts > 1 else None,
-            estimates,
-            coefficients,
-            self.moments,
-            posteriors,
+            moments=self.moments,
+            posteriors=posteriors,
+            **_knowledge(self.agent, self.known),
         )
-
-
-# The record of each pull of any agent's training on a bandit.
 
 
 class PullLog(BaseCallback):
@@ -427,18 +413,12 @@ class PullLog(BaseCallback):
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All pulls so far."""
         n_envs = self.training_env.num_envs
-        # After Ctrl-C, only some columns may have the newest pull.
-        n_pulls = min(map(len, self._columns.values())) // n_envs
         arrays: dict[str, NDArray[Any]] = {
-            name: np.array(column[: n_pulls * n_envs]).reshape(n_pulls, n_envs).T
-            for name, column in self._columns.items()
+            name: np.array(column).reshape(-1, n_envs).T for name, column in self._columns.items()
         }
         arrays["matched"] = arrays["matched"].astype(np.bool_)
         arrays["optimal"] = arrays["regrets"] == 0.0
         return arrays
-
-
-# Independent runs of any agent on a bandit, one after the other.
 
 
 def run_one_by_one(
@@ -486,15 +466,18 @@ def _run(
         env.close()
     if getattr(env.unwrapped, "n_contexts", 0) <= 1:
         run.pop("contexts", None)
-    return {**run, **_knowledge(agent)}
+    known = {name: value.cpu().numpy() for name, value in agent.policy.state_dict().items()}
+    return {**run, **_knowledge(agent, known)}
 
 
-def _knowledge(agent: Any) -> dict[str, Any]:
-    """A bandit agent's final estimates and coefficients."""
+def _knowledge(agent: Any, known: Mapping[str, Any]) -> dict[str, Any]:
+    """A bandit agent's estimates and coefficients, given the tables of one or of many runs."""
     if isinstance(agent, TableBandit):
-        return {"estimates": agent.estimates(agent.policy.tables)}
-    if isinstance(agent, LinearBanditAgent):
-        discrete = isinstance(agent.observation_space, spaces.Discrete)
-        coefficients = agent.policy.models.coefficients
-        return {"coefficients": coefficients} | ({"estimates": coefficients.T} if discrete else {})
-    return {}
+        tables = ScoreTables(known["scores"], known["sums"], known["counts"])
+        return {"estimates": agent.estimates(tables)}
+    if not isinstance(agent, LinearBanditAgent):
+        return {}
+    found = {"coefficients": known["coefficients"]}
+    if isinstance(agent.observation_space, spaces.Discrete):
+        found["estimates"] = known["coefficients"].swapaxes(-1, -2)
+    return found

@@ -31,8 +31,6 @@ from rl_yardstick.agents.compiled.references import generator_of, handles_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
-# The policy of agents that keep a score for each arm: their knowledge, in buffers.
-
 
 class BanditPolicy(ArmPolicy):
     """Pulls the arm of the highest score in the context.
@@ -64,9 +62,6 @@ class BanditPolicy(ArmPolicy):
         rows = observations.astype(np.int64).reshape(-1)
         scores: Floats = self.scores.numpy()[rows % len(self.scores)]
         return scores
-
-
-# The base of agents that keep a score for each arm in each context.
 
 
 class TableBandit(RuleBandit):
@@ -138,9 +133,6 @@ class TableBandit(RuleBandit):
     def estimates(self, tables: ScoreTables) -> Floats:
         """The agent's estimates of the arms' mean rewards, shapes (..., contexts, arms)."""
         return tables.scores
-
-
-# Epsilon-greedy and softmax around estimates of the arms' mean rewards.
 
 
 @inlined

@@ -113,7 +113,6 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
         return JsonAlgorithm._wrap_env(env, verbose, monitor_wrapper)
 
     def _setup_model(self) -> None:
-        """Seed the generators, and make the policy."""
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         self.policy = self.policy_class(self.observation_space, self.action_space)

@@ -191,11 +191,6 @@ def heeds_rollouts(callback: BaseCallback) -> bool:
     return any(getattr(kind, name) is not getattr(BaseCallback, name) for name in names)
 
 
-def wants_position(callback: BaseCallback) -> bool:
-    """Whether `BlockCallback.wants_position` holds for one of the callbacks."""
-    return any(isinstance(m, BlockCallback) and m.wants_position() for m in members(callback))
-
-
 def pass_over(callback: BaseCallback, n_calls: int, n_episodes: int) -> None:
     """Let each callback count skipped calls."""
     for member in members(callback):

@@ -92,9 +92,6 @@ def masks_of_observations(env: VecEnv, n_observations: int) -> Bools | None:
     return found
 
 
-# Policies that store the mask of each observation.
-
-
 class MaskBufferPolicy(TablePolicy):
     """A policy that can store a mask for each observation, also in its model file."""
 

@@ -64,9 +64,6 @@ _ARRAY_DTYPE = re.compile(r"[<>|][biuf][1248]")
 # Exceptions that a constructor may raise for wrong values.
 _DAMAGE = (TypeError, LookupError, AttributeError, AssertionError, ArithmeticError, RecursionError)
 
-# Types of most attributes of an agent.
-_AS_THEY_ARE = frozenset({type(None), bool, int, float, str})
-
 
 class UnknownTypeError(TypeError):
     """The file format cannot represent an object."""
@@ -84,8 +81,6 @@ class Codec:
 
 def encode(value: Any) -> Any:
     """Turn ``value`` into JSON."""
-    if type(value) in _AS_THEY_ARE:
-        return value
     if type(value) in (dict, OrderedDict):  # a VecEnv's observations; Monitor's episode records
         return {TYPE: "dict", "pairs": [[*map(encode, pair)] for pair in value.items()]}
     if isinstance(value, np.generic):

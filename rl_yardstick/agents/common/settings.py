@@ -107,9 +107,9 @@ FINITE, NOT_NEGATIVE, POSITIVE = Range(), Range(0), Range(0, is_open=True)
 SHARE, POSITIVE_SHARE = Range(0, 1), Range(0, 1, is_open=True)
 
 
-def whole(low: int, high: float = 1e9) -> Range:
-    """The whole numbers from ``low`` to ``high``."""
-    return Range(low, high, is_whole=True)
+def whole(low: int) -> Range:
+    """The whole numbers from ``low`` to a billion."""
+    return Range(low, 1e9, is_whole=True)
 
 
 EPSILONS = dict.fromkeys(

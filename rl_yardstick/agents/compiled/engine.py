@@ -9,13 +9,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from rl_yardstick.agents.common.callbacks import (
+    BlockCallback,
     EpisodeBudget,
     Horizon,
     horizon,
     members,
     pass_over,
     unknown_callbacks,
-    wants_position,
 )
 from rl_yardstick.agents.compiled.env_states import (
     COMPENSATED_SUM,
@@ -27,7 +27,6 @@ from rl_yardstick.agents.compiled.env_states import (
 )
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
 from rl_yardstick.agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
-from rl_yardstick.agents.compiled.references import handles_of
 from rl_yardstick.agents.compiled.worlds import (
     EPISODE,
     PROGRESS,
@@ -61,9 +60,6 @@ class CompiledEngine:
         self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
         self.states = EnvStates(agent.env, self.world, self.seen)
         self.envs = self.states.records
-        # Handles do not keep their generators alive.
-        self.generators = [env.unwrapped.np_random for env in agent.env.envs]
-        self.handles = handles_of(self.generators)
         self.progress = np.zeros(1, dtype=PROGRESS)
         self.log = EpisodeLog(
             np.zeros(self.block_steps * agent.n_envs, dtype=EPISODE),
@@ -82,25 +78,20 @@ class CompiledEngine:
         for name, schedule in agent.schedules().items():
             progress[f"{name}_schedule"] = compiled_schedule(schedule)
             progress[name] = schedule(agent._current_progress_remaining)
-        self._take_generators()
         return self.learner
-
-    def _take_generators(self) -> None:
-        """Make new handles, because a callback may have reseeded the environments."""
-        generators = [env.unwrapped.np_random for env in self.agent.env.envs]
-        if any(a is not b for a, b in zip(generators, self.generators, strict=True)):
-            self.generators, self.handles = generators, handles_of(generators)
 
     def run(self, total_timesteps: int) -> None:
         """Train until ``num_timesteps`` reaches ``total_timesteps`` or a callback stops it."""
         try:
-            while not self._is_over(total_timesteps) and self._run_block(total_timesteps):
+            while self._steps_left(total_timesteps) > 0 and self._run_block(total_timesteps):
                 pass
         finally:
             self._write()
 
-    def _is_over(self, total_timesteps: int) -> bool:
-        return bool(self.agent.num_timesteps >= total_timesteps)
+    def _steps_left(self, total_timesteps: int) -> int:
+        """Steps of every environment until the training is over."""
+        left: int = total_timesteps - self.agent.num_timesteps
+        return -(-left // int(self.agent.n_envs))
 
     def _run_block(self, total_timesteps: int) -> bool:
         """Train for a block of steps; False once a callback asks to stop."""
@@ -120,7 +111,8 @@ class CompiledEngine:
 
     def _begin_block(self) -> None:
         """Call the callbacks, with environments up to date if one of them asks for that."""
-        if wants_position(self.callback):
+        known = (m for m in members(self.callback) if isinstance(m, BlockCallback))
+        if any(member.wants_position() for member in known):
             self._write()
             self.callback.on_rollout_start()
             self._read()
@@ -129,17 +121,17 @@ class CompiledEngine:
 
     def _limit(self, total_timesteps: int) -> Horizon:
         """The number of steps and episodes until the block must end."""
-        ahead = horizon(self.callback)
-        steps_left = -(-(total_timesteps - self.agent.num_timesteps) // self.agent.n_envs)
-        return Horizon(min(ahead.calls, steps_left, self.block_steps), ahead.episodes)
+        ahead, left = horizon(self.callback), self._steps_left(total_timesteps)
+        return Horizon(min(ahead.calls, left, self.block_steps), ahead.episodes)
 
     def _step(self, limit: Horizon) -> int:
         """Act and learn in compiled code, but for the last step; returns the number of steps."""
+        self.states.take_generators()  # a callback may have reseeded the environments
         return run_block(
             self.world,
             self._learner(),
             self.envs,
-            self.handles,
+            self.states.handles,
             self.progress[0],
             self.log,
             limit.calls,
@@ -362,13 +354,10 @@ def play_episodes(agent: Any, copy: CompiledCopy, n_episodes: int) -> Episodes:
     env, world, seen = copy
     n_envs, player = env.num_envs, agent.greedy_player(seen)
     wanted = (n_episodes + np.arange(n_envs)) // n_envs
-    states = EnvStates(env, world, seen)
     observations = env.reset()
+    states, progress = EnvStates(env, world, seen), np.zeros(1, dtype=PROGRESS)
     states.read()
     states.take_observations(observations)
-    # Handles do not keep their generators alive.
-    generators = [env.unwrapped.np_random for env in states.vec_env.envs]
-    handles, progress = handles_of(generators), np.zeros(1, dtype=PROGRESS)
     log = EpisodeLog(
         np.zeros(STEPS_AT_ONCE * n_envs, dtype=EPISODE), np.empty((STEPS_AT_ONCE, n_envs))
     )
@@ -379,7 +368,8 @@ def play_episodes(agent: Any, copy: CompiledCopy, n_episodes: int) -> Episodes:
         if (n_missing := int((wanted - n_ended).clip(0).sum())) == 0:
             break
         limits = STEPS_AT_ONCE, n_missing, COMPENSATED_SUM
-        n_steps = run_block(world, player, states.records, handles, progress[0], log, *limits)
+        told = world, player, states.records, states.handles, progress[0], log
+        n_steps = run_block(*told, *limits)
         learn_from_last_step(player, states.records, progress[0])
         if hasattr(player, "check"):
             player.check()

@@ -21,6 +21,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from rl_yardstick.agents.compiled.loop import add_to_return, by_type, reset, step
+from rl_yardstick.agents.compiled.references import handles_of
 from rl_yardstick.agents.compiled.worlds import (
     CAR_STATE,
     STATE,
@@ -178,8 +179,14 @@ class EnvStates:
             state += [(name, np.float32, (len(self.vector_state),)) for name in vectors]
         self.records = env_records(vec_env.num_envs, env_dtype(*state))
         self.monitors = [monitor_of(env) for env in vec_env.envs]
+        self.take_generators()
         # Monitor keeps the rewards of the running episode, so we keep them too.
         self._unfinished: list[list[Floats]] = [[] for _ in vec_env.envs]
+
+    def take_generators(self) -> None:
+        """Make handles of the environments' generators, which are kept alive here."""
+        self.generators = [env.unwrapped.np_random for env in self.vec_env.envs]
+        self.handles = handles_of(self.generators)
 
     def observations(self, records: Any, prefix: str) -> Any:
         """The observations now (no prefix), before (``next_``) or after a reset (``new_``)."""

@@ -113,7 +113,6 @@ class LearningAlgorithm(OnlineAlgorithm):
         return {**sizes, **self.policy_kwargs}
 
     def _make_policy(self) -> BasePolicy:
-        """Make the untrained policy."""
         return self.policy_class(
             self.observation_space, self.action_space, self.lr_schedule, **self._policy_arguments()
         )

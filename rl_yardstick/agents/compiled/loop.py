@@ -37,17 +37,16 @@ _DEFINITIONS: Counter[str] = Counter()
 _NAMES: set[str] = set()
 
 
-class CompiledOnlyError(TypeError):
-    """A function of `by_type` was called from Python; it exists in compiled code only."""
-
-
 def by_type_or_this(stub: Function) -> Function:
     """As `by_type`; the function itself serves the classes that have none of that name."""
     return by_type(stub, stub)
 
 
 def by_type(stub: Function, default: Function | None = None) -> Function:
-    """Make a compiled function that calls the function of that name of its first argument."""
+    """Make a compiled function that calls the function of that name of its first argument.
+
+    It exists in compiled code only.
+    """
     if IS_INTERPRETED:
         raise RuntimeError("agents need Numba's compiler: unset NUMBA_DISABLE_JIT")
     name = stub.__name__

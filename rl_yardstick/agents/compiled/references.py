@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
 
 
+_intrinsic: Any = intrinsic  # it removes the first argument, which type checkers cannot know
 _ADDRESSES = ("state", "next_uint64", "next_uint32", "next_double")
 
 HANDLE = np.dtype([(name, np.uintp) for name in _ADDRESSES], align=True)
@@ -44,7 +45,7 @@ def handles_of(generators: Sequence[Generator]) -> NDArray[np.void]:
     return handles
 
 
-@intrinsic
+@_intrinsic  # type: ignore[untyped-decorator]
 def _generator(
     typing_context: Any, state: Any, next_uint64: Any, next_uint32: Any, next_double: Any
 ) -> Any:
@@ -63,14 +64,10 @@ def _generator(
     return types.npy_rng(*[types.uintp] * len(_ADDRESSES)), build
 
 
-# Numba removes the first argument, which type checkers cannot know.
-_generator_of_addresses: Any = _generator
-
-
 @internal
 def generator_of(handle: Any) -> Generator:
     """The generator of a handle, for use in compiled code."""
-    generator: Generator = _generator_of_addresses(
+    generator: Generator = _generator(
         handle.state, handle.next_uint64, handle.next_uint32, handle.next_double
     )
     return generator
@@ -125,10 +122,8 @@ def _words(value: Any) -> Iterator[int]:
         yield from value.strides
     elif isinstance(value, float):
         yield int(np.float64(value).view(np.int64))
-    elif isinstance(value, int | np.uintp) and not isinstance(value, bool):
-        yield int(value)
     else:
-        raise TypeError(f"a reference cannot hold {type(value).__name__}")
+        yield int(value)
 
 
 def _n_words(kind: Any) -> int:
@@ -195,7 +190,7 @@ def address_of(function: Any, reference: Reference) -> np.uintp:
     return np.uintp(code.library.get_pointer_to_function(name))
 
 
-@intrinsic
+@_intrinsic  # type: ignore[untyped-decorator]
 def _call(typing_context: Any, address: Any, reference: Any, first: Any, second: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         address, reference, *numbers = arguments
@@ -208,12 +203,8 @@ def _call(typing_context: Any, address: Any, reference: Any, first: Any, second:
     return types.int64(types.uintp, reference, types.float64, types.float64), build
 
 
-# Numba removes the first argument, which type checkers cannot see.
-_call_address: Any = _call
-
-
 @internal
 def call(address: Any, reference: Any, first: float, second: float) -> int:
     """Call the function at an address of `address_of`, with a reference or its address."""
-    result: int = _call_address(address, reference, first, second)
+    result: int = _call(address, reference, first, second)
     return result

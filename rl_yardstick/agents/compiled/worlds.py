@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from rl_yardstick.agents.common.schedules import ScheduleRow
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.envs.known_models import (
     model_check,
@@ -40,9 +41,7 @@ from rl_yardstick.mdp.transition_model import Floats, Ints, TransitionModel
 # Passing a record costs compiled code nothing. Passing as many arrays would cost more than the
 # learning itself.
 
-SCHEDULE = np.dtype(
-    [(name, np.float64) for name in ("kind", "start", "end", "end_fraction")], align=True
-)
+SCHEDULE = np.dtype([(name, np.float64) for name in ScheduleRow._fields], align=True)
 
 # One environment and its last step.
 _ENV_FIELDS = [
@@ -191,7 +190,6 @@ class FiniteModel(NamedTuple):
 # CartPole as compiled code; observations may be bin numbers.
 
 STATE = ("x", "x_dot", "theta", "theta_dot")
-CART_POLE_ENV = env_dtype(*((name, np.float64) for name in STATE))
 
 
 @inlined
@@ -285,7 +283,6 @@ class CartPole(NamedTuple):
 # MountainCar as compiled code.
 
 CAR_STATE = ("position", "velocity")
-MOUNTAIN_CAR_ENV = env_dtype(*((name, np.float64) for name in CAR_STATE))
 
 
 class MountainCar(NamedTuple):

@@ -110,9 +110,6 @@ class SemiGradientAlgorithm(TileAlgorithm):
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
 
-# Semi-gradient Q-learning.
-
-
 class SemiGradientQ(SemiGradientAlgorithm):
     """Semi-gradient Q-learning (Sutton and Barto, chapter 11).
 
@@ -121,9 +118,6 @@ class SemiGradientQ(SemiGradientAlgorithm):
     """
 
     next_value = best_next_value
-
-
-# Semi-gradient SARSA.
 
 
 @called

@@ -29,11 +29,11 @@ from rl_yardstick.agents.common.settings import (
 )
 from rl_yardstick.agents.compiled.engine import EngineChoice
 from rl_yardstick.agents.compiled.env_states import BEFORE, observe
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import by_type
 from rl_yardstick.agents.compiled.references import handles_of
 from rl_yardstick.agents.compiled.worlds import UNDECIDED, env_dtype
 from rl_yardstick.agents.tabular.workspace import Workspace, WorkspaceAlgorithm
-from rl_yardstick.machine_code.compiling import called, kernel
+from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
 # Tile coding: an observation has one active tile in each of several tilings.
@@ -89,17 +89,12 @@ def active_tiles(tiles: Tiles, vector: Floats, active: Ints) -> None:
             active[tiling] += (step + displacement) // tiles.n_tilings * along.stride
 
 
-@kernel
-def active_tiles_of_all(tiles: Tiles, vectors: Floats, active: Ints) -> None:
-    """`active_tiles` of n vectors, shapes (n, d) and (n, n_tilings)."""
-    for i in range(len(vectors)):
-        active_tiles(tiles, vectors[i], active[i])
-
-
+@compiled
 def tiles_of_all(tiles: Tiles, vectors: Floats) -> Ints:
     """The active tiles of n vectors of shape (n, d), shape (n, n_tilings)."""
     active = np.empty((len(vectors), tiles.n_tilings), dtype=np.int64)
-    active_tiles_of_all(tiles, vectors, active)
+    for i in range(len(vectors)):
+        active_tiles(tiles, vectors[i], active[i])
     return active
 
 
@@ -242,7 +237,7 @@ class HandedVectors(NamedTuple):
 @by_type
 def choose_by_sums(agent: LinearAgent, progress: Any) -> int:
     """An action by ``agent.room.values``."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @called
@@ -286,9 +281,6 @@ def act_on_tiles(agent: LinearAgent, env: Any, progress: Any) -> None:
         env.action = choose(agent, agent.room.tiles, progress)
 
 
-# The policy of agents on active tiles: their weights, in buffers.
-
-
 class TilePolicy(TablePolicy):
     """Takes the action of the highest sum of weights over the active tiles."""
 
@@ -322,7 +314,6 @@ class TilePolicy(TablePolicy):
         return sums
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        """The first of the best actions for each observation, shape (n,)."""
         return th.from_numpy(self.sums(observation.numpy()).argmax(axis=1))
 
 

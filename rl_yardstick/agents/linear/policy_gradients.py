@@ -108,9 +108,6 @@ class SoftmaxAlgorithm(TileAlgorithm):
         return action_probabilities(BOLTZMANN, sums, 1.0, random_ties=False)
 
 
-# One-step actor-critic.
-
-
 class Critic(NamedTuple):
     """The state of the agent besides its preferences."""
 
@@ -163,8 +160,6 @@ class ActorCritic(SoftmaxAlgorithm):
     def _make_memory(self) -> Critic:
         return Critic(self.policy.state_weights.numpy(), np.ones(self.n_envs))
 
-
-# REINFORCE, with and without a baseline.
 
 Baseline = Literal["none", "value"]
 

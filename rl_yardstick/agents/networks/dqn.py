@@ -462,17 +462,12 @@ class QTraining(NetworkTraining):
             }
         return record_of(
             RULES,
-            gamma=agent.gamma,
-            tau=agent.tau,
-            max_grad_norm=agent.max_grad_norm,
-            largest_error=agent.largest_error,
+            agent,
             target_kind=_TARGETS[agent.target_kind],
             n_steps=n_steps,
             handles_timeouts=buffer.handle_timeout_termination,
-            learning_starts=agent.learning_starts,
             train_freq=agent.train_freq.frequency,
             counts_episodes=agent.train_freq.unit == TrainFrequencyUnit.EPISODE,
-            gradient_steps=agent.gradient_steps,
             target_interval=max(agent.target_update_interval // agent.n_envs, 1),
             **normalising,
         )
@@ -522,9 +517,9 @@ class QTraining(NetworkTraining):
         agent.exploration_rate = float(place["exploration_rate"])
         agent.collected = (int(place["collected"]), int(place["collected_episodes"]))
 
-    def until_end(self, total_timesteps: int) -> int:
-        """As in the base class, but until the next training is due."""
-        left, place, rules = super().until_end(total_timesteps), self.place[0], self.held.rules[0]
+    def until_end(self, left: int) -> int:
+        """The steps until the first training that is due after ``left`` steps."""
+        place, rules = self.place[0], self.held.rules[0]
         begun, whole = int(place["collected"]), int(rules["train_freq"])
         if rules["counts_episodes"]:
             return max(left, min(begun, 1))

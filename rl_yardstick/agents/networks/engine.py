@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from torch import nn
 
-from rl_yardstick.agents.common.callbacks import Horizon, horizon
+from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.exploration import greedy_action
 from rl_yardstick.agents.compiled.engine import CompiledEngine
 from rl_yardstick.agents.compiled.env_states import BEFORE, Numbers, look
@@ -265,17 +265,12 @@ class NetworkTraining:
             wrong = int(shown[(shown < 0) | (shown >= self.seen.n)][0])
             raise ValueError(f"observation {wrong} is not in {self.agent.observation_space}")
 
-    def until_end(self, total_timesteps: int) -> int:
-        """Steps of every environment until the training is over."""
-        left: int = total_timesteps - self.agent.num_timesteps
-        return -(-left // int(self.agent.n_envs))
 
-
-def record_of(kind: np.dtype[np.void], **values: Any) -> Any:
-    """An array of shape (1,) with one record."""
+def record_of(kind: np.dtype[np.void], agent: Any = None, **values: Any) -> Any:
+    """An array of shape (1,) with one record: of values, else the agent's attributes, else 0."""
     records = np.zeros(1, dtype=kind)
-    for name, value in values.items():
-        records[name] = value
+    for name in kind.names or ():
+        records[name] = values.get(name, getattr(agent, name, 0))
     return records
 
 
@@ -307,12 +302,11 @@ class NetworkEngine(CompiledEngine):
         for name, schedule in self.agent.schedules().items():
             self.progress[0][f"{name}_schedule"] = compiled_schedule(schedule)
         self.training.read_settings()
-        self._take_generators()
         return self.in_loop
 
-    def _is_over(self, total_timesteps: int) -> bool:
+    def _steps_left(self, total_timesteps: int) -> int:
         # As in the library, the current rollout is collected to its end.
-        return bool(self.training.until_end(total_timesteps) <= 0)
+        return int(self.training.until_end(super()._steps_left(total_timesteps)))
 
     def _begin_block(self) -> None:
         if self.has_begun:
@@ -321,10 +315,10 @@ class NetworkEngine(CompiledEngine):
         self.has_begun = True
 
     def _limit(self, total_timesteps: int) -> Horizon:
-        ahead, log = horizon(self.callback), self.training.until_log(self.log_interval)
-        left = self.training.until_end(total_timesteps)
-        steps = min(ahead.calls, log.calls, left, self.block_steps, self.steps_at_once)
-        return Horizon(max(steps, 1), min(ahead.episodes, log.episodes))
+        limit = super()._limit(total_timesteps)
+        log = self.training.until_log(self.log_interval)
+        steps = min(limit.calls, log.calls, self.steps_at_once)
+        return Horizon(max(steps, 1), min(limit.episodes, log.episodes))
 
     def _step(self, limit: Horizon) -> int:
         began = time.perf_counter()

@@ -41,8 +41,6 @@ from rl_yardstick.agents.networks.engine import (
 )
 from rl_yardstick.agents.networks.perceptron import Inputs, one_thread
 
-# Conditions for compiled trainings of the library's agents.
-
 
 def check_agent(agent: Any) -> None:
     """Raise `NotCompilable` if compiled functions cannot do all that an agent does."""
@@ -126,8 +124,6 @@ class Work:
         step = COMPILED_STEP + COMPILED_WEIGHT * self.n_dense_weights
         return self.n_steps * step + self.n_updates * self.batch_size * row
 
-
-# The argument ``engine`` of the library's agents, and its effect on training.
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
 TOO_SHORT = "so short a training is not worth compiling"

@@ -9,24 +9,24 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.core import cgutils, types
-from numba.extending import get_cython_function_address, intrinsic
+from numba import types
+from numba.np.linalg import _BLAS, ensure_blas
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from rl_yardstick.machine_code.compiling import internal, vectorised, view
 from rl_yardstick.mdp.transition_model import Ints
 
-# Products of matrices in single precision, by SciPy's BLAS: Numba's own `numpy.dot` counts
-# references, which compiled loops here avoid. BLAS stores matrices by columns, so it gets the
-# transposed problem: the rows of a matrix are its columns.
+# Products of matrices in single precision, by the routine of SciPy's BLAS that is behind Numba's
+# `numpy.dot`. That function counts references, which compiled loops here avoid. BLAS stores
+# matrices by columns, so it gets the transposed problem: the rows of a matrix are its columns.
 
 Singles = NDArray[np.float32]
 
-ir: Any = vars(cgutils)["ir"]  # llvmlite's, which comes with Numba
-
-AS_IT_IS = ord("N")
-TRANSPOSED = ord("T")
+SINGLE, AS_IT_IS, TRANSPOSED = map(ord, "sNT")
+_gemm: Any = _BLAS.numba_xxgemm(types.float32)  # type: ignore[no-untyped-call]
+# The factors of the product, and of the earlier content of its array.
+_FACTOR, _ADDED = np.ones(1, np.float32), np.zeros(1, np.float32)
 
 _controller = cache(ThreadpoolController)  # made when SciPy's BLAS is loaded
 
@@ -36,94 +36,32 @@ def one_thread() -> AbstractContextManager[Any]:
 
     The matrices are too small for several threads, whose number would change the last bits.
     """
-    sgemm_address()
+    ensure_blas()  # type: ignore[no-untyped-call]
     limited: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
     return limited
 
 
-def sgemm_address() -> np.uintp:
-    """The address of BLAS's routine in this process, for compiled functions."""
-    return np.uintp(get_cython_function_address("scipy.linalg.cython_blas", "sgemm"))
-
-
-@intrinsic
-def _sgemm(
-    typing_context: Any,
-    address: Any,
-    first_kind: Any,
-    second_kind: Any,
-    m: Any,
-    n: Any,
-    k: Any,
-    first: Any,
-    first_stride: Any,
-    second: Any,
-    second_stride: Any,
-    product: Any,
-    product_stride: Any,
-) -> Any:
-    """BLAS's ``sgemm`` with factors 1 and 0; it takes all arguments by address."""
-
-    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        address, first_kind, second_kind, *numbers = arguments
-        m, n, k, first, first_stride, second, second_stride, product, product_stride = numbers
-        place: Any = cgutils.alloca_once_value
-        single, integer, character = ir.FloatType(), ir.IntType(32), ir.IntType(8)
-
-        def kept(value: Any, kind: Any) -> Any:
-            return place(builder, builder.trunc(value, kind))
-
-        def matrix(value: Any) -> Any:
-            return builder.inttoptr(value, single.as_pointer())
-
-        one, zero = (place(builder, ir.Constant(single, factor)) for factor in (1.0, 0.0))
-        passed = [
-            kept(first_kind, character),
-            kept(second_kind, character),
-            *(kept(size, integer) for size in (m, n, k)),
-            one,
-            matrix(first),
-            kept(first_stride, integer),
-            matrix(second),
-            kept(second_stride, integer),
-            zero,
-            matrix(product),
-            kept(product_stride, integer),
-        ]
-        kind = ir.FunctionType(ir.VoidType(), [value.type for value in passed])
-        builder.call(builder.inttoptr(address, kind.as_pointer()), passed)
-        return context.get_dummy_value()
-
-    size, place = types.int64, types.uintp
-    return (
-        types.void(place, size, size, size, size, size, place, size, place, size, place, size),
-        build,
-    )
-
-
-# Numba removes the first argument, which type checkers cannot see.
-_call: Any = _sgemm
-
-
 @internal
 def multiply(
-    sgemm: Any, left: Singles, left_kind: int, right: Singles, right_kind: int, product: Singles
+    left: Singles, left_kind: int, right: Singles, right_kind: int, product: Singles
 ) -> None:
     """The product of two matrices, each `AS_IT_IS` or `TRANSPOSED`."""
     m, n = product.shape
     inner = left.shape[1] if left_kind == AS_IT_IS else left.shape[0]
-    _call(
-        sgemm,
+    _gemm(
+        SINGLE,
         right_kind,
         left_kind,
         n,
         m,
         inner,
-        right.ctypes.data,
+        _FACTOR.ctypes,
+        right.ctypes,
         right.shape[1],
-        left.ctypes.data,
+        left.ctypes,
         left.shape[1],
-        product.ctypes.data,
+        _ADDED.ctypes,
+        product.ctypes,
         n,
     )
 
@@ -218,7 +156,6 @@ class Layers(NamedTuple):
     outputs_at: Ints  # start of each layer's outputs in an array of outputs, per row, shape (L,)
     activation: int  # after each layer but the last: `IDENTITY`, `RELU` or `TANH`
     one_hot: int  # 1 if inputs are indices of one-hot vectors, else 0
-    sgemm: np.uintp  # the address of BLAS's routine
 
 
 class Inputs(NamedTuple):
@@ -245,7 +182,6 @@ def make_layers(sizes: Sequence[int], start: int, activation: int, *, one_hot: b
         np.cumsum(outputs) - outputs,
         activation,
         int(one_hot),
-        sgemm_address(),
     )
 
 
@@ -299,7 +235,7 @@ def forward(layers: Layers, flat: Singles, inputs: Inputs, n: int, outputs: Sing
         if layer == 0 and layers.one_hot:
             _pick_rows(weights, inputs.indices, above)
         else:
-            multiply(layers.sgemm, below, AS_IT_IS, weights, AS_IT_IS, above)
+            multiply(below, AS_IT_IS, weights, AS_IT_IS, above)
         activate(above, bias, layers.activation if layer < n_layers - 1 else IDENTITY)
         below = above
 
@@ -334,13 +270,13 @@ def backward(
             if layers.one_hot:
                 _add_rows(error, inputs.indices, slot)
             else:
-                multiply(layers.sgemm, inputs.vectors[:n], TRANSPOSED, error, AS_IT_IS, slot)
+                multiply(inputs.vectors[:n], TRANSPOSED, error, AS_IT_IS, slot)
             return
         below = outputs_of(layers, outputs, layer - 1, n)
         error_below = outputs_of(layers, errors, layer - 1, n)
         weights = weights_of(layers, flat, layer)
-        multiply(layers.sgemm, below, TRANSPOSED, error, AS_IT_IS, slot)
-        multiply(layers.sgemm, error, AS_IT_IS, weights, TRANSPOSED, error_below)
+        multiply(below, TRANSPOSED, error, AS_IT_IS, slot)
+        multiply(error, AS_IT_IS, weights, TRANSPOSED, error_below)
         pull_back(error_below, below, layers.activation)
 
 

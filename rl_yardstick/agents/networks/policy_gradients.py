@@ -586,14 +586,10 @@ class PolicyTraining(NetworkTraining):
         target_kl = getattr(agent, "target_kl", None)
         return record_of(
             RULES,
-            gamma=agent.gamma,
+            agent,
             buffer_gamma=agent.rollout_buffer.gamma,
             gae_lambda=agent.rollout_buffer.gae_lambda,
-            ent_coef=agent.ent_coef,
-            vf_coef=agent.vf_coef,
-            max_grad_norm=agent.max_grad_norm,
             target_kl=np.inf if target_kl is None else target_kl,
-            normalize_advantage=agent.normalize_advantage,
             n_epochs=getattr(agent, "n_epochs", 1),
             clip_range=tuple(bound(getattr(agent, "clip_range", None))),
             clip_range_vf=tuple(bound(getattr(agent, "clip_range_vf", None))),
@@ -641,10 +637,10 @@ class PolicyTraining(NetworkTraining):
         buffer.full = bool(place["n_rollouts"]) and place["step"] == 0
         buffer.pos = len(buffer.rewards) if buffer.full else int(place["step"])
 
-    def until_end(self, total_timesteps: int) -> int:
-        """As in the base class, but to the end of the last rollout."""
+    def until_end(self, left: int) -> int:
+        """The steps to the end of the rollout with the last of ``left`` steps."""
         begun, whole = int(self.place["step"][0]), int(self.agent.n_steps)
-        return -(-(begun + super().until_end(total_timesteps)) // whole) * whole - begun
+        return -(-(begun + left) // whole) * whole - begun
 
     def until_log(self, log_interval: int | None) -> Horizon:
         """The steps until the next log record."""

@@ -36,7 +36,6 @@ from rl_yardstick.agents.common.settings import (
     POSITIVE,
     SHARE,
     ExplorationDecay,
-    TieBreaking,
     check_space,
 )
 from rl_yardstick.agents.compiled.engine import EngineChoice, Plan
@@ -44,7 +43,6 @@ from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.references import handles_of
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.tabular.updates import (
-    MaskedTables,
     Room,
     Tables,
     TabularAgent,
@@ -123,7 +121,6 @@ class QTablePolicy(MaskBufferPolicy):
         return np.where(masks | ~masks.any(axis=1, keepdims=True), values, -np.inf)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        """The first of the best allowed actions for each observation, shape (n,)."""
         obs = numbers_in(self.observation_space, observation).reshape(-1)
         return th.from_numpy(self.allowed_values(obs).argmax(axis=1))
 
@@ -226,12 +223,10 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         exploration_decay: ExplorationDecay = "linear",
         temperature: float | Schedule = 1.0,
         noise_std: float | Schedule = 1.0,
-        tie_breaking: TieBreaking = "random",
         initial_q: float = 0.0,
         initial_q_std: float = 0.0,
         skip_terminal_update: bool = False,
         engine: EngineChoice = "auto",
-        policy_kwargs: dict[str, Any] | None = None,
         mask_actions: bool = False,
         **kwargs: Any,
     ) -> None:
@@ -251,7 +246,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         self.masks_are_known = False
         self.last_steps: NDArray[np.void] | None = None
         self._infos: list[dict[str, Any]] = []
-        super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
+        super().__init__(policy, env, learning_rate, **kwargs)
 
     def _check_arguments(self) -> None:
         if self.mask_actions and self.env is not None:
@@ -297,9 +292,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         n_draws = draws_per_choice(self.strategy, n_actions)
         return TabularAgent(
             self.settings()[0],
-            MaskedTables(values, counts, policy.masks)
-            if self.mask_actions
-            else Tables(values, counts),
+            Tables(values, counts, policy.masks),
             Room(np.empty(n_actions), np.arange(n_actions), np.empty(n_draws)),
             handles_of([rng])[0],
             self._memory_in_use(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -11,13 +10,12 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this
+from rl_yardstick.agents.compiled.loop import by_type, by_type_or_this
 from rl_yardstick.agents.compiled.references import next_uniform
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy, TabularAlgorithm
 from rl_yardstick.agents.tabular.q_learning_and_sarsa import QLearning
 from rl_yardstick.agents.tabular.updates import (
     TabularAgent,
-    action_at,
     best_value,
     learning_in_turn,
     room_at,
@@ -61,7 +59,13 @@ def add_pair(model: Any, obs: int, action: int) -> None:
         model.n_pairs[0] += 1
 
 
-# The policy of tabular agents that learn a model, which their model file contains, too.
+class ModelArray(NamedTuple):
+    """An array of a learnt model, which begins full of its least value."""
+
+    shape: tuple[int, ...]
+    end: int = 2**62  # integers must be below this
+    least: int = 0  # and at least this
+    kind: Any = np.int64
 
 
 class ModelPolicy(QTablePolicy):
@@ -73,29 +77,24 @@ class ModelPolicy(QTablePolicy):
     def __init__(self, *args: Any, outcomes_kept: int = 1, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.outcomes_kept = outcomes_kept
+        arrays = self._arrays()
+        for name in self.model_type._fields:
+            begin = np.full(arrays[name].shape, arrays[name].least, arrays[name].kind)
+            self.register_buffer(f"model_{name}", th.from_numpy(begin))
+
+    def _arrays(self) -> dict[str, ModelArray]:
+        """The arrays of a model by name; its type says which ones it has."""
         n_states, n_actions = self.visit_counts.shape[1:]
-        for name, array in self._nothing_learnt(n_states, n_actions, outcomes_kept).items():
-            self.register_buffer(f"model_{name}", th.from_numpy(array))
-
-    def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
-        """The arrays of an empty model, by name."""
-        shape = n_states, n_actions, n
+        n_pairs, shape = n_states * n_actions, (n_states, n_actions, self.outcomes_kept)
         return {
-            "next_obs": np.zeros(shape, dtype=np.int64),
-            "rewards": np.zeros(shape),
-            "terminated": np.zeros(shape, dtype=np.bool_),
-            "counts": np.zeros(shape[:2], dtype=np.int64),
-            "pairs": np.zeros(n_states * n_actions, dtype=np.int64),
-            "n_pairs": np.zeros(1, dtype=np.int64),
-        }
-
-    def _places(self, n_states: int, n_pairs: int) -> Mapping[str, tuple[int, int]]:
-        """The range (least, end) of arrays with indices of states, pairs or places."""
-        return {
-            "next_obs": (0, n_states),
-            "pairs": (0, n_pairs),
-            "n_pairs": (0, n_pairs + 1),
-            "counts": (0, 2**62),
+            "next_obs": ModelArray(shape, n_states),
+            "rewards": ModelArray(shape, kind=np.float64),
+            "terminated": ModelArray(shape, kind=np.bool_),
+            "counts": ModelArray(shape[:2]),
+            "pairs": ModelArray((n_pairs,), n_pairs),
+            "n_pairs": ModelArray((1,), n_pairs + 1),
+            "tried_at": ModelArray(shape[:2]),
+            "time": ModelArray((1,)),
         }
 
     @property
@@ -119,14 +118,12 @@ class ModelPolicy(QTablePolicy):
 
     def check_places(self) -> None:
         """Raise ValueError for a model with indices out of range."""
-        n_states, n_actions = self.visit_counts.shape[1:]
-        for name, (least, end) in self._places(n_states, n_states * n_actions).items():
-            numbers = getattr(self.model, name)
-            if not ((numbers >= least) & (numbers < end)).all():
+        arrays, model = self._arrays(), self.model
+        for name in model._fields:
+            numbers, array = getattr(model, name), arrays[name]
+            fits = (numbers >= array.least) & (numbers < array.end)
+            if array.kind is np.int64 and not fits.all():
                 raise ValueError(f"holds no model for these observations and actions: model_{name}")
-
-
-# The base of tabular agents that learn a model of their environment.
 
 
 class ModelKeeper(TabularAlgorithm):
@@ -141,13 +138,10 @@ class ModelKeeper(TabularAlgorithm):
         return self.policy.model
 
 
-# Dyna-Q.
-
-
 @by_type
 def remember(agent: TabularAgent, env: Any) -> None:
     """Update the model with the environment's last step."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @by_type_or_this
@@ -230,9 +224,6 @@ class DynaQ(ModelKeeper, QLearning):
         super().__init__(*args, **kwargs)
 
 
-# Dyna-Q+.
-
-
 class DatedModel(NamedTuple):
     """A model with the times of its outcomes."""
 
@@ -256,7 +247,7 @@ def remember_outcome_and_time(agent: TabularAgent, env: Any) -> None:
     if seen == 0:
         room = room_at(agent.tables, env.obs, agent.room)
         for k in range(len(room.values)):
-            add_pair(model, env.obs, action_at(agent.tables, room, k))
+            add_pair(model, env.obs, room.actions[k])
     note_outcome(model, env)
     model.time[0] += 1
     model.tried_at[env.obs, env.action] = model.time[0]
@@ -273,13 +264,6 @@ class DatedModelPolicy(ModelPolicy):
     """The policy of Dyna-Q+."""
 
     model_type: ClassVar[Any] = DatedModel
-
-    def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
-        times = {
-            "tried_at": np.zeros((n_states, n_actions), dtype=np.int64),
-            "time": np.zeros(1, dtype=np.int64),
-        }
-        return {**super()._nothing_learnt(n_states, n_actions, n), **times}
 
 
 class DynaQPlus(DynaQ):

@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from rl_yardstick.agents.common.exploration import greedy_action, highest_value
 from rl_yardstick.agents.common.settings import whole
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.loop import by_type
 from rl_yardstick.agents.tabular.algorithm import QTablePolicy
 from rl_yardstick.agents.tabular.n_step import EpisodicAlgorithm, place_of, probability_of
 from rl_yardstick.agents.tabular.updates import (
@@ -45,7 +45,7 @@ class EpisodeRecords(NamedTuple):
 @by_type
 def learn_episode(agent: TabularAgent, env: Any, progress: Any, i: int, length: int) -> float:
     """Learn from the record of environment ``i``; returns the mean absolute error."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @inlined
@@ -98,9 +98,6 @@ class RecordAlgorithm(EpisodicAlgorithm):
         )
 
 
-# The policy of off-policy Monte Carlo control: action values, and the sums of their weights.
-
-
 class ImportanceTablePolicy(QTablePolicy):
     """Greedy in a table of action values, each the weighted mean of returns."""
 
@@ -110,9 +107,6 @@ class ImportanceTablePolicy(QTablePolicy):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.register_buffer("weights", th.zeros_like(self.q_tables))
-
-
-# On-policy Monte Carlo control.
 
 
 @inlined
@@ -163,8 +157,6 @@ class MonteCarlo(RecordAlgorithm):
         return self._memory._replace(of_entries=room)
 
 
-# Off-policy Monte Carlo control.
-
 # With larger weights their sum could become infinite.
 LARGEST_WEIGHT = 1e150
 
@@ -193,7 +185,7 @@ def learn_by_importance(agent: TabularAgent, env: Any, progress: Any, i: int, le
         total_error += abs(error)
         n_learnt += 1
         room = values_at(agent, state, 0)
-        is_greedy = place_of(agent, room, action) == greedy_action(room.values, 0.0)
+        is_greedy = place_of(room, action) == greedy_action(room.values, 0.0)
         if records.probabilities[i, k] <= 0.0 or not is_greedy:
             break
         weight /= records.probabilities[i, k]

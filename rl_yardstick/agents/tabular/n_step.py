@@ -20,7 +20,6 @@ from rl_yardstick.agents.tabular.updates import (
     NOTHING_LEARNT,
     Room,
     TabularAgent,
-    action_at,
     count_visit,
     exploration_rate,
     learning_in_turn,
@@ -35,10 +34,10 @@ from rl_yardstick.mdp.transition_model import Floats, Ints
 
 
 @inlined
-def place_of(agent: TabularAgent, room: Room, action: int) -> int:
+def place_of(room: Room, action: int) -> int:
     """The index of an action's value in the room; -1 if it is not allowed."""
     for k in range(len(room.values)):
-        if action_at(agent.tables, room, k) == action:
+        if room.actions[k] == action:
             return k
     return -1
 
@@ -46,7 +45,7 @@ def place_of(agent: TabularAgent, room: Room, action: int) -> int:
 @inlined
 def probability_of(agent: TabularAgent, room: Room, action: int, progress: Any) -> float:
     """The probability of the action under the exploring policy, by the values in the room."""
-    place = place_of(agent, room, action)
+    place = place_of(room, action)
     if place < 0:
         return 0.0
     settings, rate = agent.settings, exploration_rate(agent, progress)
@@ -169,17 +168,12 @@ class WindowAlgorithm(EpisodicAlgorithm):
         return Windows(states, actions, np.zeros(shape), oldest, lengths)
 
 
-# n-step SARSA.
-
-
 class NStepSARSA(WindowAlgorithm):
     """n-step SARSA (Sutton and Barto, section 7.2); with one step it is SARSA."""
 
     commit = commit_to_next_action
     next_value = committed_value
 
-
-# n-step tree backup.
 
 TargetPolicy = Literal["exploring", "greedy"]
 GREEDY = 1
@@ -199,7 +193,7 @@ def target_probability(agent: TabularAgent, room: Room, action: int, progress: A
     """The target policy's probability of the action; the greedy one gives 1 to any best action."""
     if agent.settings.target_policy != GREEDY:
         return probability_of(agent, room, action, progress)
-    place = place_of(agent, room, action)
+    place = place_of(room, action)
     return 1.0 if place >= 0 and room.values[place] == highest_value(room.values) else 0.0
 
 
@@ -375,9 +369,6 @@ class TraceAlgorithm(EpisodicAlgorithm):
         return Traces(states, actions, np.zeros(shape), lengths, np.zeros(self.n_envs))
 
 
-# SARSA(lambda).
-
-
 class SARSALambda(TraceAlgorithm):
     """SARSA(lambda) (Rummery and Niranjan, 1994; Sutton and Barto, section 12.7).
 
@@ -386,9 +377,6 @@ class SARSALambda(TraceAlgorithm):
 
     commit = commit_to_next_action
     next_value = committed_value
-
-
-# Watkins's Q(lambda).
 
 
 @inlined

@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.common.settings import (
     EPSILONS,
     FINITE,
     NOT_NEGATIVE,
     POSITIVE,
-    TieBreaking,
     whole,
 )
-from rl_yardstick.agents.compiled.engine import EngineChoice
 from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
-from rl_yardstick.agents.tabular.dyna import ModelKeeper, ModelPolicy
+from rl_yardstick.agents.tabular.dyna import ModelArray, ModelKeeper, ModelPolicy
 from rl_yardstick.agents.tabular.updates import TabularAgent, best_value, learning_in_turn
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-
-# The base of agents that explore by optimism: a table that begins at an upper bound.
 
 
 class OptimisticAlgorithm(TabularAlgorithm):
@@ -58,29 +51,9 @@ class OptimisticAlgorithm(TabularAlgorithm):
         *("noise_std", "initial_q", "initial_q_std", "skip_terminal_update"),
     )
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "QTablePolicy",
-        env: GymEnv | str | None = None,
-        gamma: float = 0.99,
-        value_bound: float | None = None,
-        tie_breaking: TieBreaking = "random",
-        engine: EngineChoice = "auto",
-        policy_kwargs: dict[str, Any] | None = None,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, *args: Any, value_bound: float | None = None, **kwargs: Any) -> None:
         self.value_bound = value_bound
-        super().__init__(
-            policy,
-            env,
-            gamma=gamma,
-            exploration_decay="constant",
-            exploration_initial_eps=0.0,
-            tie_breaking=tie_breaking,
-            engine=engine,
-            policy_kwargs=policy_kwargs,
-            **kwargs,
-        )
+        super().__init__(*args, exploration_decay="constant", exploration_initial_eps=0.0, **kwargs)
 
     def _check_arguments(self) -> None:
         if self.value_bound is None and self.gamma == 1:
@@ -94,9 +67,6 @@ class OptimisticAlgorithm(TabularAlgorithm):
         if self.value_bound is None:
             return 1.0 / (1.0 - self.gamma) if self.gamma < 1 else math.inf
         return self.value_bound
-
-
-# Q-learning with upper confidence bounds.
 
 
 @inlined
@@ -255,9 +225,6 @@ def replan(agent: TabularAgent) -> None:
             return
 
 
-# R-max.
-
-
 @inlined
 def learn_and_replan(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
     """Count the environment's step, and plan if that makes its pair known."""
@@ -279,20 +246,16 @@ class CountedModelPolicy(ModelPolicy):
 
     model_type: ClassVar[Any] = CountedModel
 
-    def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
-        arrays = super()._nothing_learnt(n_states, n_actions, n)
-        del arrays["pairs"], arrays["n_pairs"]
+    def _arrays(self) -> dict[str, ModelArray]:
+        n_states, n_actions = self.visit_counts.shape[1:]
+        n = self.outcomes_kept
         return {
-            **arrays,
-            "tallies": np.zeros((n_states, n_actions, n), dtype=np.int64),
-            "states": np.zeros(n_states, dtype=np.int64),
-            "n_states": np.zeros(1, dtype=np.int64),
+            **super()._arrays(),
+            "tallies": ModelArray((n_states, n_actions, n), n + 1),
+            "counts": ModelArray((n_states, n_actions), n + 1),
+            "states": ModelArray((n_states,), n_states),
+            "n_states": ModelArray((1,), n_states + 1),
         }
-
-    def _places(self, n_states: int, n_pairs: int) -> Mapping[str, tuple[int, int]]:
-        most = self.outcomes_kept + 1
-        limits = {"states": (0, n_states), "n_states": (0, n_states + 1)}
-        return {"next_obs": (0, n_states), "counts": (0, most), "tallies": (0, most), **limits}
 
     def check_places(self) -> None:
         """Raise ValueError for a model with indices out of range or inconsistent counts."""

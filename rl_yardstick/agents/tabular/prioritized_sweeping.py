@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
-from rl_yardstick.agents.tabular.dyna import ModelKeeper, ModelPolicy, note_outcome
+from rl_yardstick.agents.tabular.dyna import ModelArray, ModelKeeper, ModelPolicy, note_outcome
 from rl_yardstick.agents.tabular.updates import TabularAgent, best_value
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
@@ -127,40 +126,23 @@ def _sink(model: SweepingModel, pair: int, n: int) -> None:
     _put(model, pair, place)
 
 
-# The policy of prioritised sweeping, whose model file contains the queue.
-
-
 class SweepingPolicy(ModelPolicy):
     """Greedy in a table, with a `SweepingModel` beside it."""
 
     model_type: ClassVar[Any] = SweepingModel
 
-    def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
-        arrays = super()._nothing_learnt(n_states, n_actions, n)
-        del arrays["pairs"], arrays["n_pairs"]
+    def _arrays(self) -> dict[str, ModelArray]:
+        n_states, n_actions = self.visit_counts.shape[1:]
         n_pairs = n_states * n_actions
-        none = {"first_into": n_states, "behind": n_pairs, "before": n_pairs, "place": n_pairs}
+        of_pairs = ModelArray((n_pairs,), n_pairs, NONE)
         return {
-            **arrays,
-            **{name: np.full(size, NONE, dtype=np.int64) for name, size in none.items()},
-            "queue": np.zeros(n_pairs, dtype=np.int64),
-            "n_queued": np.zeros(1, dtype=np.int64),
-            "urgency": np.zeros(n_pairs),
+            **super()._arrays(),
+            "first_into": ModelArray((n_states,), n_pairs, NONE),
+            **dict.fromkeys(("behind", "before", "place"), of_pairs),
+            "queue": ModelArray((n_pairs,), n_pairs),
+            "n_queued": ModelArray((1,), n_pairs + 1),
+            "urgency": ModelArray((n_pairs,), kind=np.float64),
         }
-
-    def _places(self, n_states: int, n_pairs: int) -> Mapping[str, tuple[int, int]]:
-        places = super()._places(n_states, n_pairs)
-        links = dict.fromkeys(("first_into", "behind", "before"), (NONE, n_pairs))
-        return {
-            **{name: places[name] for name in ("next_obs", "counts")},
-            **links,
-            "queue": (0, n_pairs),
-            "n_queued": (0, n_pairs + 1),
-            "place": (NONE, n_pairs),
-        }
-
-
-# Prioritised sweeping.
 
 
 @inlined

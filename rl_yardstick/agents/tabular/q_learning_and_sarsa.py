@@ -9,8 +9,6 @@ from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
 from rl_yardstick.agents.tabular.updates import TabularAgent, choose, exploration_rate
 from rl_yardstick.machine_code.compiling import inlined
 
-# Q-learning.
-
 
 @inlined
 def best_next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
@@ -22,9 +20,6 @@ class QLearning(TabularAlgorithm):
     """Q-learning (Watkins, 1989; Sutton and Barto, section 6.5)."""
 
     next_value = best_next_value
-
-
-# SARSA.
 
 
 @inlined
@@ -52,9 +47,6 @@ class SARSA(TabularAlgorithm):
     next_value = committed_value
 
 
-# Expected SARSA.
-
-
 @inlined
 def mean_next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
     """The mean value under the exploring policy."""
@@ -70,9 +62,6 @@ class ExpectedSARSA(TabularAlgorithm):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         self._refuse_gaussian_noise("expected_sarsa")
-
-
-# Double Q-learning.
 
 
 @inlined

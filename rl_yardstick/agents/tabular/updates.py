@@ -11,13 +11,11 @@ from rl_yardstick.agents.common.exploration import (
     random_action,
 )
 from rl_yardstick.agents.common.settings import step_size
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type, by_type_or_this, move_on
+from rl_yardstick.agents.compiled.loop import by_type, by_type_or_this, move_on
 from rl_yardstick.agents.compiled.references import generator_of, next_uniform
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-
-# The tables of an agent for compiled functions, and scratch arrays.
 
 
 class Room(NamedTuple):
@@ -28,29 +26,40 @@ class Room(NamedTuple):
     draws: Floats  # the random numbers of one choice, shape (draws_per_choice,)
 
 
-@by_type
-def room_at(tables: Any, obs: int, room: Room) -> Room:
-    """The room for the actions that are allowed at ``obs``."""
-    raise CompiledOnlyError
+class Tables(NamedTuple):
+    """The tables of an agent, in the memory of its policy, and the action masks."""
 
-
-@by_type
-def action_at(tables: Any, room: Room, k: int) -> int:
-    """The action of ``room.values[k]``."""
-    raise CompiledOnlyError
-
-
-@by_type
-def with_mean_values(tables: Any, obs: int, room: Room) -> Room:
-    """The room, with the means of the tables' values of its actions; do not change them."""
-    raise CompiledOnlyError
+    values: Floats  # action values, shape (T, S, A)
+    visit_counts: Ints  # updates of each entry so far, shape (T, S, A)
+    # The allowed actions at each observation, bool of shape (S, A); all actions if a row is all
+    # False (mask unknown). Without masks it has no rows.
+    allowed: Bools
 
 
 @inlined
-def average_tables(tables: Any, obs: int, room: Room) -> Room:
-    """The room, filled with the means of the tables' values of its actions."""
+def room_at(tables: Tables, obs: int, room: Room) -> Room:
+    """The part of the room for the actions that are allowed at ``obs``, which it lists."""
+    if len(tables.allowed) == 0:
+        return room
+    actions, n_allowed = room.actions, 0
+    for action in range(len(actions)):
+        if tables.allowed[obs, action]:
+            actions[n_allowed] = action
+            n_allowed += 1
+    if n_allowed == 0:
+        n_allowed = len(actions)
+        for action in range(n_allowed):
+            actions[action] = action
+    return Room(room.values[:n_allowed], actions[:n_allowed], room.draws)
+
+
+@inlined
+def with_mean_values(tables: Tables, obs: int, room: Room) -> Room:
+    """The room, with the means of the tables' values of its actions; do not change them."""
+    if len(tables.allowed) == 0 and tables.values.shape[0] == 1:
+        return Room(tables.values[0, obs], room.actions, room.draws)
     for k in range(len(room.values)):
-        action = action_at(tables, room, k)
+        action = room.actions[k]
         room.values[k] = tables.values[0, obs, action]
         if tables.values.shape[0] > 1:
             room.values[k] = 0.5 * (room.values[k] + tables.values[1, obs, action])
@@ -58,67 +67,9 @@ def average_tables(tables: Any, obs: int, room: Room) -> Room:
 
 
 @inlined
-def best_value(tables: Any, obs: int, room: Room) -> float:
+def best_value(tables: Tables, obs: int, room: Room) -> float:
     """The highest of the mean values of the actions that are allowed at ``obs``."""
     return highest_value(with_mean_values(tables, obs, room_at(tables, obs, room)).values)
-
-
-class Tables(NamedTuple):
-    """The tables of an agent, in the memory of its policy, if all actions are allowed."""
-
-    values: Floats  # action values, shape (T, S, A)
-    visit_counts: Ints  # updates of each entry so far, shape (T, S, A)
-
-    @inlined
-    def room_at(self, obs: int, room: Room) -> Room:
-        """The whole room: all actions are allowed."""
-        return room
-
-    @inlined
-    def action_at(self, room: Room, k: int) -> int:
-        """The k-th action."""
-        return k
-
-    @inlined
-    def with_mean_values(self, obs: int, room: Room) -> Room:
-        """A view of the table's row if there is one table, else the means."""
-        if self.values.shape[0] == 1:
-            return Room(self.values[0, obs], room.actions, room.draws)
-        return average_tables(self, obs, room)
-
-
-class MaskedTables(NamedTuple):
-    """The tables of an agent, and the action masks."""
-
-    values: Floats
-    visit_counts: Ints
-    # The allowed actions at each observation, bool of shape (S, A); all actions if a row is all
-    # False (mask unknown).
-    allowed: Bools
-
-    @inlined
-    def room_at(self, obs: int, room: Room) -> Room:
-        """The part of the room for the allowed actions, which it lists."""
-        actions, n_allowed = room.actions, 0
-        for action in range(len(actions)):
-            if self.allowed[obs, action]:
-                actions[n_allowed] = action
-                n_allowed += 1
-        if n_allowed == 0:
-            n_allowed = len(actions)
-            for action in range(n_allowed):
-                actions[action] = action
-        return Room(room.values[:n_allowed], actions[:n_allowed], room.draws)
-
-    @inlined
-    def action_at(self, room: Room, k: int) -> int:
-        """The k-th allowed action."""
-        return int(room.actions[k])
-
-    @inlined
-    def with_mean_values(self, obs: int, room: Room) -> Room:
-        """The means of the tables, in the room."""
-        return average_tables(self, obs, room)
 
 
 # Acting on a table of action values, and moving its entries towards their targets.
@@ -135,7 +86,7 @@ class TabularAgent(NamedTuple):
     """An agent for compiled functions."""
 
     settings: Any  # a record of its class's type
-    tables: Any  # `Tables` or `MaskedTables`
+    tables: Tables
     room: Room  # scratch arrays
     rng: Any  # a handle of its generator
     memory: Any  # further arrays of its algorithm; see `TabularAlgorithm`
@@ -150,7 +101,7 @@ def next_value(agent: Any, env: Any, progress: Any, table: int) -> float:
     in ``agent.room.actions``; ``env.uniform`` is in [0, 1), a random number if there are several
     tables.
     """
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @by_type_or_this
@@ -182,7 +133,7 @@ def choose(agent: TabularAgent, obs: int, progress: Any) -> int:
     if chosen < 0:
         values = with_mean_values(tables, obs, room).values
         chosen = choose_action(settings.strategy, values, rate, settings.tie_scale, room.draws)
-    return action_at(tables, room, chosen)
+    return int(room.actions[chosen])
 
 
 @inlined
@@ -199,7 +150,7 @@ def values_at(agent: TabularAgent, obs: int, table: int) -> Room:
     """The room, filled with a table's values of the actions that are allowed at ``obs``."""
     room = room_at(agent.tables, obs, agent.room)
     for k in range(len(room.values)):
-        room.values[k] = agent.tables.values[table, obs, action_at(agent.tables, room, k)]
+        room.values[k] = agent.tables.values[table, obs, room.actions[k]]
     return room
 
 
@@ -273,7 +224,7 @@ NOTHING_LEARNT = -1.0
 @by_type
 def learn_in(agent: Any, env: Any, progress: Any, i: int) -> float:
     """Learn from the step of environment ``i``; the absolute TD error, or `NOTHING_LEARNT`."""
-    raise CompiledOnlyError
+    raise NotImplementedError
 
 
 @inlined
