@@ -234,10 +234,12 @@ def _made(make: Callable[..., Any], scripted: Any) -> Callable[..., Any]:
     """What makes generators, which follow the script unless they are given a seed."""
 
     def made(*given: Any, **named: Any) -> Any:
-        return make(*given, **named) if {*given, *named.values()} - {None} else scripted
+        is_seeded = {*given, *named.values()} - {None}
+        is_of_scipy = sys._getframe(1).f_globals["__name__"].startswith("scipy.")  # at its import
+        return make(*given, **named) if is_seeded or is_of_scipy else scripted
 
     if isinstance(make, type):  # others may ask what is an instance of it
-        return type(make.__name__, (make,), {"__new__": lambda _, *given: made(*given)})
+        return type(make.__name__, (make,), {"__new__": lambda _, *given, **named: made(*given, **named)})
     return made
 
 

@@ -24,7 +24,6 @@ from rl_yardstick.envs.model_of.symbols import Drawn, Limit, Stop
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 MOST_ENTRIES = 100_000_000  # of the arrays of a model
-MOST_COMPARED = 100  # runs that came back to where a loop began
 MOST_SPANS = 1000  # times at which one action can do different things, if episodes have no end
 LEVELS = (1e-6, *np.linspace(0.01, 0.99, 49).tolist(), 1 - 1e-6)
 
@@ -100,7 +99,7 @@ class Tree:
         back: list[list[int]] = []
         try:
             one = self._below(choices[:first], first, back)
-            others = [self._below(path, len(path), []) for path in back[:MOST_COMPARED]]
+            others = [self._below(path, len(path), []) for path in [*back[:1], *back[1:][-1:]]]
         except Stop:
             self.loops[place] = False
         except Suspect as inner:  # is judged first
