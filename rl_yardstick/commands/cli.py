@@ -301,9 +301,15 @@ def register_typed(args: argparse.Namespace) -> None:
 
     from rl_yardstick.pipeline.components import module_name
 
-    typed = sys.modules.get(module_name(args.gym_packages[-1])) if args.gym_packages else None
-    if args.env not in registry and callable(kind := getattr(typed, args.env, None)):
+    if args.env in registry or not args.gym_packages:
+        return
+    name = module_name(args.gym_packages[-1])
+    if callable(kind := getattr(sys.modules.get(name), args.env, None)):
+        if any(spec.name == args.env for spec in registry.values()):
+            args.env = f"{name}.{args.env}"  # else it would be the other one's newest version
         registry[args.env] = EnvSpec(args.env, kind)
+    elif args.env.isidentifier():
+        raise UserError(f"{args.gym_packages[-1]} has no class {args.env!r}")
 
 
 def check_alone(

@@ -38,6 +38,8 @@ Env = gym.Env[Any, Any]
 STEPS_COMPARED = 300  # of the environment, for the name of a file
 SAID_AFTER = 2.0  # seconds of a search
 MOST_FILES = 200
+KINDS_OF_FILES = {".csv", ".json", ".npy", ".npz", ".py", ".toml", ".txt", ".yaml", ".yml"}
+MOST_BYTES = 1_000_000  # of a file that an environment may read
 SECONDS_OF_REFUSALS = 86_400.0  # on a slow day, a search may run out of time
 
 
@@ -90,8 +92,7 @@ def found(core: Env) -> FoundModel | NotFound | None:
     an array, or None. A search leaves the environment as it is: it works on a copy.
     """
     wanted, is_own = limits(), type(core).__module__.startswith("rl_yardstick.")
-    is_own &= not isinstance(core, gym.Wrapper)
-    if wanted is None or is_own or not isinstance(core.action_space, gym.spaces.Discrete):
+    if wanted is None or (is_own and not isinstance(core, gym.Wrapper)):
         return None
     if core not in _of_object or _of_object[core][0] != wanted:
         _of_object[core] = wanted, _by_name(core, wanted)
@@ -102,18 +103,20 @@ def _by_name(core: Env, limits: Limits) -> FoundModel | NotFound:
     """The result of an earlier search in the same code, or of a new one."""
     if is_changed(core.unwrapped):  # a method of the copy may act on the original
         return NotFound("a method was replaced by hand")
+    what = "cannot be copied"
     try:
-        twin = copy_of(core)
-        name = None if core.spec is None else _name_of(twin, limits)
+        fresh, played, what = copy_of(core), copy_of(core), "fails"
+        is_kept = core.spec is not None and isinstance(core.action_space, gym.spaces.Discrete)
+        name = _name_of(played, limits) if is_kept else None
     except Exception as error:  # noqa: BLE001  # the environment may raise any
-        return NotFound(f"the environment cannot be copied: {' '.join(str(error).split())}")
+        return NotFound(f"the environment {what}: {' '.join(str(error).split())}")
     if name is None:
-        return _search(twin, limits)
+        return _search(fresh, limits)
     if name not in _of_name:
         file = _folder() / f"{name}.npz"
         result = _read(file)
         if result is None:
-            result = _search(twin, limits)
+            result = _search(fresh, limits)
             _write(file, result)
         _of_name[name] = result
     return _of_name[name]
@@ -207,11 +210,17 @@ def _first_steps(env: Any) -> Iterator[Any]:
 
 
 def _files_of(modules: set[str]) -> list[Path]:
-    """The source files of modules, and those beside them."""
-    known = {name for name in modules if name.partition(".")[0] not in sys.stdlib_module_names}
-    files = {getattr(sys.modules.get(name), "__file__", None) for name in known}
-    folders = {Path(file).parent for file in files if file is not None}
-    return sorted(path for folder in folders for path in folder.glob("*.py"))
+    """The source files of modules and of their packages, and small files beside them."""
+    found = set[Path]()
+    for name in modules:
+        top, *below = name.split(".")
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if file is None or top in {*sys.stdlib_module_names, "gymnasium"}:
+            continue
+        root = Path(file).parents[len(below) - (Path(file).name != "__init__.py")]
+        found |= {*(root.rglob("*.py") if below else ()), *Path(file).parent.iterdir()}
+    known = {path for path in found if path.suffix in KINDS_OF_FILES and path.is_file()}
+    return sorted(path for path in known if path.stat().st_size < MOST_BYTES)
 
 
 # --- on disk --------------------------------------------------------------------------------------

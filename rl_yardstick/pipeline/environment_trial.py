@@ -29,6 +29,7 @@ from rl_yardstick.pipeline.errors import UserError, shown
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
 SEED, N_STEPS = 0, 200
+SEED_OF_ACTIONS = 1_000  # with `SEED`, a space would draw the numbers that the environment draws
 MOST_SECONDS = 2.0  # after which a slow environment has been played long enough
 KNOWN = ("rl_yardstick", "gymnasium", "ale_py")
 WITHOUT_EPISODE = "rl_yardstick.envs.wrappers.WithoutEpisodeInfo"
@@ -58,6 +59,10 @@ class Finding:
 
 class Findings(dict[str, Finding]):
     """The first finding of each name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.since = time.monotonic()  #: when the environment was last called
 
     def add(self, name: str, what: str, where: str = "") -> None:
         """Add a finding, unless that name was found before; long texts are shortened."""
@@ -89,7 +94,7 @@ def play(
     """
     # An environment may make its own space anew, or seed it, in `reset`.
     space, actions = env.observation_space, copy.deepcopy(env.action_space)
-    actions.seed(SEED)
+    actions.seed(SEED_OF_ACTIONS)
     obs, action, until = env.reset(seed=SEED)[0], None, time.monotonic() + MOST_SECONDS
     _look_at_observation(found, space, obs, "step 0")
     steps = [Step(seen := digest(obs))]
@@ -97,7 +102,7 @@ def play(
         where = f"step {len(steps)}"
         before()
         action = action if same_action and action is not None else _chosen(env, actions)
-        begin = time.perf_counter()
+        found.since, begin = time.monotonic(), time.perf_counter()
         outcome = env.step(copy.deepcopy(action))
         seconds = time.perf_counter() - begin
         if digest(obs) != seen:

@@ -97,7 +97,7 @@ FALSE = {
     "reward": (lambda: Corridor(outcomes(goal_reward=10.0), outcomes()),
         rf"{SAYS} the end with the reward 9, the environment made one$"),
     "unknown wind": (lambda: Corridor(outcomes(wind=0.0)),
-        rf"{SAYS} 1 with the reward -1, the environment made one$"),
+        rf"{SAYS.replace('3', '.')} . with the reward -1, the environment made one$"),
     "frequency everywhere": (lambda: Careless(outcomes(0.4), outcomes()),
         r"has a probability of 0\.[46], it came \d+ of \d+ times$"),
     "frequency of a start": (

@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import gymnasium as gym
@@ -72,7 +71,7 @@ def model_of(
     Args:
         env: the environment, to be reset afterwards; wrappers are part of it, but for time limits
             and those that only watch.
-        seconds: the time after which the search gives up.
+        seconds: of processor time, after which the search gives up.
         max_states: the number of states above which it gives up.
         ignore: names of attributes that change nothing.
         progress: called now and then with the number of states found, and of those done.
@@ -118,8 +117,8 @@ def model_of(
         notes.append(f"{n:,} states stand behind {seen:,} observations")
     for error, pairs in search.illegal.items():
         notes.append(f"{pairs:,} pairs of state and action are not allowed: {error}")
-    observations, spent = search.observations * search.times, perf_counter() - search.started
-    return FoundModel(model, allowed, observations, actions, search.horizon, notes, spent)
+    observations = search.observations * search.times
+    return FoundModel(model, allowed, observations, actions, search.horizon, notes, search.spent)
 
 
 class _Seeded(gym.Wrapper[Any, Any, Any, Any]):

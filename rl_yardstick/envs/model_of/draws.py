@@ -239,7 +239,9 @@ def _made(make: Callable[..., Any], scripted: Any) -> Callable[..., Any]:
         return make(*given, **named) if is_seeded or is_of_scipy else scripted
 
     if isinstance(make, type):  # others may ask what is an instance of it
-        return type(make.__name__, (make,), {"__new__": lambda _, *given, **named: made(*given, **named)})
+        return type(
+            make.__name__, (make,), {"__new__": lambda _, *given, **named: made(*given, **named)}
+        )
     return made
 
 
