@@ -30,7 +30,7 @@ from scipy import special
 
 from rl_yardstick.envs.bandits import LoggedData, read_log
 from rl_yardstick.mdp.transition_model import Floats, Ints
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line
 from rl_yardstick.verdicts import Estimate
 
 if TYPE_CHECKING:
@@ -365,10 +365,9 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
     space = data.observation_space
     contexts = data.contexts if not isinstance(space, spaces.Discrete) else data.observations(space)
     n_arms = max([data.n_arms, *(int(space.n) for space in spaces_of_actions)])
-    try:  # means for Discrete contexts, else regressions
+    with as_user_error(str(data.source), ValueError):
+        # Means for Discrete contexts, else regressions.
         predicted = cross_fit(contexts, data.arms, data.rewards, n_arms)
-    except ValueError as error:
-        raise UserError(f"{data.source}: {one_line(error)}") from error
     notes = [note for policy in policies for note in _notes(data, policy)]
     rows = [
         Judged(policy.name, _judge(data, policy.name, probabilities(policy, data), predicted), True)
@@ -398,10 +397,8 @@ def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
     from rl_yardstick.agents.policies import policy_matrix, why_not_exact
 
     agent: Any = policy.agent
-    try:
+    with as_user_error(policy.name, ValueError):
         observations = data.observations(agent.observation_space)
-    except ValueError as error:
-        raise UserError(f"{policy.name}: {one_line(error)}") from error
     if reason := why_not_exact(agent, observations):
         raise UserError(f"{policy.name} cannot be judged on a log: {reason}")
     return policy_matrix(agent, observations)
@@ -412,10 +409,8 @@ def _judge(data: LoggedData, name: str, policy: Floats, predicted: Floats) -> Po
     padded = np.zeros(predicted.shape)
     padded[:, : policy.shape[1]] = policy
     assert data.propensities is not None
-    try:
+    with as_user_error(f"{name} on {data.source}", ValueError):
         return evaluate_policy(padded, data.arms, data.rewards, data.propensities, predicted)
-    except ValueError as error:
-        raise UserError(f"{name} on {data.source}: {one_line(error)}") from error
 
 
 def _notes(data: LoggedData, policy: LoggedPolicy) -> list[str]:

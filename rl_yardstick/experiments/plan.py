@@ -32,7 +32,7 @@ from rl_yardstick.pipeline.environments import (
     usual_kwargs,
     with_files_read,
 )
-from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.errors import UserError, as_user_error
 from rl_yardstick.pipeline.files import plain, read_json, write_json
 from rl_yardstick.pipeline.run import FINISHED, Run
 from rl_yardstick.pipeline.settings import (
@@ -167,14 +167,12 @@ def specs_of(study: StudySpec) -> dict[Labels, TrainSpec]:
     specs = {}
     for environment, agent in product(study.environments, study.agents):
         check_env_id(environment.env_id)
-        try:
+        place = f"{agent.where}: " if agent.where else ""
+        with as_user_error(f"{place}{agent.label} on {environment.label}", UserError):
             specs[agent.label, environment.label] = spec = _train_spec(study, agent, environment)
             check_fit(spec)
             with closing(make_single_env(spec)) as env:
                 found_claim(env)  # a search is done once, before the workers begin
-        except UserError as error:
-            place = f"{agent.where}: " if agent.where else ""
-            raise UserError(f"{place}{agent.label} on {environment.label}: {error}") from error
     return specs
 
 

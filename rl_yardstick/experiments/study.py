@@ -16,7 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.pipeline.components import arguments_of
 from rl_yardstick.pipeline.environments import check_env_id, map_name
-from rl_yardstick.pipeline.errors import UserError, shown, unknown
+from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknown
 from rl_yardstick.pipeline.files import LONGEST_NAME, plain, portable_name
 from rl_yardstick.pipeline.settings import (
     BUDGETS,
@@ -353,10 +353,8 @@ def read_study(path: Path) -> StudySpec:
     shared, environments = layered(file.settings, given), []
     for label, entry in file.environments.items():
         env_id = label if entry.id is None else entry.id
-        try:
+        with as_user_error(str(path), UserError):
             check_env_id(env_id)
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from error
         own = {**(AS_IT_COMES if entry.as_it_comes else {}), **entry.settings}
         environments.append(EnvironmentSpec(label, env_id, layered(shared, own)))
     return StudySpec(

@@ -30,7 +30,14 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from rl_yardstick.agents.own_classes import SMALLEST
 from rl_yardstick.agents.registry import ALGORITHMS, BY_VALUE, add_class
-from rl_yardstick.pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
+from rl_yardstick.pipeline.errors import (
+    UserError,
+    as_user_error,
+    did_you_mean,
+    one_line,
+    shown,
+    unknown,
+)
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
 # Names in files are looked up in these packages, and in modules that the user typed. Importing
@@ -183,10 +190,8 @@ def find_class(name: str, bases: tuple[type, ...], where: str, typed: list[str])
     if not any(f"{module}.".startswith(f"{package}.") for package in packages):
         fault = f"none of the packages that may be named ({', '.join(packages)})"
         raise UserError(f"{where}: {name} is in {fault}; admit others with --gym-packages")
-    try:
+    with as_user_error(f"{where}: {name}", ImportError):
         inside = importlib.import_module(module)
-    except ImportError as error:
-        raise UserError(f"{where}: {name}: {one_line(error)}") from error
     found = getattr(inside, cls, None)
     if isinstance(found, type) and issubclass(found, bases):
         return found
@@ -210,10 +215,8 @@ def build(
         kwargs.setdefault("save_path", str(folder))
     if "kwargs" not in names and (foreign := next((k for k in kwargs if k not in names), None)):
         raise unknown(f"{place}: unknown argument", foreign, names[len(inner) :])
-    try:
+    with as_user_error(place, TypeError, ValueError, AssertionError, Error):
         return cls(*inner, **build_value(kwargs, place, typed))
-    except (TypeError, ValueError, AssertionError, Error) as error:
-        raise UserError(f"{place}: {one_line(error)}") from error
 
 
 def _inside(name: str, value: Any, folder: Path | None, where: str) -> Any:
@@ -286,14 +289,11 @@ def schedule(text: str, for_library: bool) -> Any:
     from rl_yardstick.agents.common.schedules import ExponentialSchedule, library_schedule
 
     kind, *numbers = text.split("_")
-    try:
+    with as_user_error(f"{text} is no schedule such as lin_0.001 or exp_0.5_0.01", ValueError):
         start, end = [*map(float, numbers), 0.0][:2]
         if kind == "lin":
             return LinearSchedule(start, end, 1.0)
         found = ExponentialSchedule(start, end)
-    except ValueError as error:
-        fault = f"{text} is no schedule such as lin_0.001 or exp_0.5_0.01: {one_line(error)}"
-        raise UserError(fault) from error
     return library_schedule(found) if for_library else found
 
 

@@ -21,7 +21,7 @@ from rl_yardstick.envs.wrappers import (
     has_masks,
 )
 from rl_yardstick.pipeline.components import build, import_modules, split_id
-from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
+from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line, shown, unknown
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # The time limit of evaluations if neither environment nor settings have one: a greedy policy that
@@ -180,11 +180,9 @@ def _wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = No
     env = env if entry is None else entry.numbered(env)
     # Without masks, `check_fit` names the agents that fit.
     needs_masks = entry is not None and entry.needs_masks and has_masks(env)
-    try:
+    with as_user_error("mask_actions", ValueError):
         is_masked = spec.algorithm.get("mask_actions", False) or needs_masks
         return ActionMasks(env) if is_masked else env
-    except ValueError as error:
-        raise UserError(f"mask_actions: {one_line(error)}") from error
 
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> Env:
@@ -275,10 +273,8 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         kwargs: Any = found.get(key) if isinstance(found.get(key), dict) else {}
         desc, log = kwargs.get("desc"), kwargs.get("log")
         if isinstance(desc, str) and _makes(env_id, GridWorld | FrozenLakeEnv):
-            try:
+            with as_user_error(env_id, ValueError):
                 found[key] = {**kwargs, "desc": list(read_rows(desc))}
-            except ValueError as error:
-                raise UserError(f"{env_id}: {one_line(error)}") from error
         if isinstance(log, str) and _makes(env_id, ReplayBandit):
             found[key] = {**kwargs, "log": str(Path(log).absolute())}
     return found

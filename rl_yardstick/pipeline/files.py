@@ -14,11 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.errors import UserError, as_user_error
 from rl_yardstick.safe_files.files import UnsafeFileError, content_of
 
 MAX_TEXT = 10_000_000  # bytes of a settings file
-MAX_ARRAYS = 1 << 31  # bytes of an archive of arrays
+MAX_TABLE = 1 << 31  # bytes of a table, or of an archive of arrays
 LONGEST_NAME = 100  # bytes; Windows limits a whole path to 260 characters
 
 _REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
@@ -55,10 +55,8 @@ def read_text(path: Path, limit: int = MAX_TEXT) -> str:
 
 def read_json(path: Path, limit: int = MAX_TEXT) -> Any:
     """The content of a JSON file."""
-    try:
+    with as_user_error(f"{path} is no valid JSON", ValueError, RecursionError):
         return json.loads(read_text(path, limit))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is no valid JSON: {error}") from error
 
 
 def read_arrays(
@@ -74,8 +72,8 @@ def read_arrays(
 
     found: dict[str, Any] = {}
     lengths: dict[str, int] = {}
-    try:
-        members = read_members(read_bytes(path, MAX_ARRAYS))
+    with as_user_error(f"{path} is damaged", ValueError, LookupError, OverflowError, MemoryError):
+        members = read_members(read_bytes(path, MAX_TABLE))
         for name in [n for n in shapes if n not in optional or f"{n}.npy" in members]:
             array = read_array(io.BytesIO(members[f"{name}.npy"]), allow_pickle=False)
             sizes = zip(shapes[name].split(), array.shape, strict=True)
@@ -83,8 +81,6 @@ def read_arrays(
             if array.dtype.kind not in "biuf" or tuple(wanted) != array.shape:
                 raise ValueError(f"{name} has another shape or kind")
             found[name] = array
-    except (ValueError, LookupError, OverflowError, MemoryError) as error:
-        raise UserError(f"{path} is damaged: {error}") from error
     return found
 
 

@@ -9,19 +9,31 @@ import re
 import shutil
 import signal
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from types import FrameType
 from typing import Any, Self
+from warnings import catch_warnings
 
+import numpy as np
 from filelock import FileLock, Timeout
 from pydantic import ValidationError
 from rich.console import Console
 
-from rl_yardstick.pipeline.errors import Stopped, UserError
-from rl_yardstick.pipeline.files import read_json, replacing, write_json, write_text
+from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline.errors import Stopped, UserError, as_user_error
+from rl_yardstick.pipeline.files import (
+    MAX_TABLE,
+    read_bytes,
+    read_json,
+    replacing,
+    write_json,
+    write_text,
+)
 from rl_yardstick.pipeline.spec import TrainSpec
 
 RUNNING, FINISHED, INTERRUPTED, FAILED = "running", "finished", "interrupted", "failed"
@@ -172,6 +184,38 @@ def statistics_beside(model: Path) -> Path:
     if model.stem == "best_model":
         return model.with_name("best_model_vecnormalize.pkl")
     return model.with_suffix("") / "vecnormalize.pkl"
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The training episodes of a run, ordered by their ends; each array has the shape (n,)."""
+
+    steps: Floats  # steps up to the end, over all environments
+    returns: Floats  # undiscounted returns
+    seconds: Floats  # time since the beginning
+
+
+def read_episodes(folder: Path, limit: int = MAX_TABLE) -> Episodes:
+    """Read the training episodes in Monitor's files, each of at most ``limit`` bytes."""
+    tables, columns = [], {"delimiter": ",", "usecols": (0, 1, 2)}  # wrappers may add others
+    for path in sorted(folder.glob("*.monitor.csv")):
+        content = BytesIO(read_bytes(path, limit))
+        with as_user_error(f"{path} is damaged", ValueError), catch_warnings(action="ignore"):
+            # Without an episode it has two lines, and NumPy warns.
+            tables.append(np.loadtxt(content, skiprows=2, ndmin=2, **columns).reshape(-1, 3))
+    if not tables:
+        raise UserError(f"{folder} has no 0.monitor.csv")
+    return joined_episodes(tables)
+
+
+def joined_episodes(tables: Sequence[Floats]) -> Episodes:
+    """The episodes of all environments of a run: for each return, length, time, shape (n, 3)."""
+    # The environments step together, so all have done the same number of steps.
+    steps = np.concatenate([len(tables) * table[:, 1].cumsum() for table in tables])
+    order = np.argsort(steps, kind="stable")
+    rows = np.concatenate(tables)[order]
+    # Episodes that end in one step are written a moment after each other, in no fixed order.
+    return Episodes(steps[order], rows[:, 0], np.maximum.accumulate(rows[:, 2]))
 
 
 def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:

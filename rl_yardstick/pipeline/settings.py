@@ -29,7 +29,7 @@ from rl_yardstick.pipeline.components import (
     check_arguments,
     digests_of,
 )
-from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
+from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknown
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec, validated
 
@@ -85,10 +85,9 @@ def read_yaml(path: Path) -> Any:
 @lru_cache  # a file is read for each agent, environment and trial
 def parse_yaml(text: str, where: str) -> Any:
     """The plain values that a text in YAML spells."""
-    try:
+    kinds = yaml.YAMLError, ValueError, TypeError, RecursionError
+    with as_user_error(f"{where} is no valid YAML", *kinds):
         return yaml.load(text, Loader=_Loader)  # noqa: S506  # a safe loader
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise UserError(f"{where} is no valid YAML: {' '.join(str(error).split())}") from error
 
 
 def _check_names(found: Any, words: str) -> dict[str, Any]:
@@ -136,10 +135,8 @@ def read_entry(
         same = [s.id for s in named if (s.entry_point, s.kwargs, s.max_episode_steps) == meant]
         key = same[0] if same else key
     if key is None and not {*arguments_of(algo), *SPECIAL}.isdisjoint(entries):
-        try:  # one entry without an id, as in rl_zoo3's config.yml
-            return from_trial(algo, entries)
-        except (TypeError, LookupError) as error:
-            raise UserError(f"{path}: these are no hyperparameters: {one_line(error)}") from error
+        with as_user_error(f"{path}: these are no hyperparameters", TypeError, LookupError):
+            return from_trial(algo, entries)  # one without an id, as in rl_zoo3's config.yml
     if key is None:
         way_out = "give hyperparameters with -params, or another file with --conf-file"
         raise UserError(f"{unknown(f'{path}: no entry for', env_id, entries, n=3)}; {way_out}")

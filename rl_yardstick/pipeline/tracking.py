@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.errors import as_user_error
 from rl_yardstick.pipeline.run import Run
 from rl_yardstick.pipeline.spec import TrainSpec
 
 
 @contextmanager
-def tracked(run: Run, spec: TrainSpec, **where: Any) -> Iterator[None]:
+def tracked(run: Run, spec: TrainSpec, where: dict[str, Any]) -> Iterator[None]:
     """Send what TensorBoard is told to Weights & Biases, until the block ends.
 
     Args:
@@ -26,7 +26,7 @@ def tracked(run: Run, spec: TrainSpec, **where: Any) -> Iterator[None]:
     import wandb
 
     config = {"algo": spec.algo, "env": spec.env_id, "seed": spec.seed, **spec.hyperparams}
-    try:
+    with as_user_error("--track", wandb.Error):
         tracking = wandb.init(
             name=f"{spec.algo}/{run.path.name}",
             dir=run.path,
@@ -35,7 +35,5 @@ def tracked(run: Run, spec: TrainSpec, **where: Any) -> Iterator[None]:
             settings=wandb.Settings(console="off", silent=run.console.quiet),
             **where,
         )
-    except wandb.Error as error:
-        raise UserError(f"--track: {error}") from error
     with tracking:
         yield

@@ -20,7 +20,7 @@ from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.environments import MISTAKES
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.files import replacing, write_json
-from rl_yardstick.pipeline.run import RECORD
+from rl_yardstick.pipeline.run import RECORD, read_episodes
 
 if TYPE_CHECKING:
     from rl_yardstick.experiments.results import StudyResults
@@ -151,7 +151,6 @@ def write_films(results: StudyResults) -> tuple[list[Path], list[str]]:
 
 def _films_of_training(planned: PlannedRun, folder: Path) -> Iterator[Path]:
     """A film for each checkpoint that was due, named by the number of the episode before it."""
-    from rl_yardstick.experiments.results import read_episodes
     from rl_yardstick.pipeline.evaluation.sampled import evaluation_seed
 
     name = f"{file_name(planned.agent)}_{file_name(planned.environment)}"

@@ -29,7 +29,7 @@ from optuna.trial import FrozenTrial, TrialState
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.experiments.plan import PlannedRun, plan
 from rl_yardstick.experiments.results import read_run
-from rl_yardstick.pipeline.errors import UserError, one_line, shown
+from rl_yardstick.pipeline.errors import UserError, as_user_error, shown
 from rl_yardstick.pipeline.files import plain
 from rl_yardstick.tuning.search_spaces import read_search_space
 from rl_yardstick.tuning.suggesting import (
@@ -386,11 +386,9 @@ def open_storage(root: Path) -> BaseStorage:
             os.truncate(path, len(content) + whole)
     for lock in root.glob(f"{OWN_FILE}.lock*"):
         lock.unlink()  # of a process that was killed
-    try:
+    with as_user_error(f"{path} is damaged", ValueError, LookupError, TypeError, AssertionError):
         storage = JournalStorage(JournalFileBackend(str(path), JournalFileOpenLock(str(path))))
         studies = storage.get_all_studies()
-    except (ValueError, LookupError, TypeError, AssertionError) as error:
-        raise UserError(f"{path} is damaged: {one_line(error)}") from error
     for study in studies:
         if ASKED not in study.user_attrs and storage.get_n_trials(study._study_id):
             other = f"holds the Optuna study {study.study_name} of another program"
