@@ -14,12 +14,7 @@ from gymnasium.envs.registration import load_env_creator
 
 import rl_yardstick.envs  # noqa: F401  # registers this project's environments
 from rl_yardstick.agents.registry import ALGORITHMS, fitting_algorithms, is_bandit
-from rl_yardstick.envs.wrappers import (
-    ActionMasks,
-    DiscretizeObservation,
-    FlattenToDiscrete,
-    has_masks,
-)
+from rl_yardstick.envs import wrappers
 from rl_yardstick.pipeline.components import build, import_modules, split_id
 from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line, shown, unknown
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -143,7 +138,7 @@ def check_fit(spec: TrainSpec) -> None:
     with closing(make_single_env(spec, training=True)) as env:
         if misfit := ALGORITHMS[spec.algo].env_misfit(env):
             spaces = env.observation_space, env.action_space
-            fitting = fitting_algorithms(*spaces, is_bandit(env), has_masks(env))
+            fitting = fitting_algorithms(*spaces, is_bandit(env), wrappers.has_masks(env))
             ways = [f"fitting agents: {', '.join(fitting)}"] if fitting else []
             ways += [f"add {flag}" for flag in _fitting_wrappers(spec, env)]
             others = "; or ".join(ways) or "no agent here fits"
@@ -156,7 +151,7 @@ def _fitting_wrappers(spec: TrainSpec, env: Env) -> Iterator[str]:
     bins: dict[str, Any] = {"bins": 10}
     if isinstance(space, gym.spaces.Box) and not space.is_bounded():
         bins |= {"low": -3.0, "high": 3.0}
-    for kind, kwargs in ((FlattenToDiscrete, {}), (DiscretizeObservation, bins)):
+    for kind, kwargs in ((wrappers.FlattenToDiscrete, {}), (wrappers.DiscretizeObservation, bins)):
         with suppress(ValueError):
             wrapped: Any = kind(env, **kwargs)
             n = getattr(wrapped.observation_space, "n", 0)
@@ -179,10 +174,10 @@ def _wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = No
     entry = ALGORITHMS.get(spec.algo)
     env = env if entry is None else entry.numbered(env)
     # Without masks, `check_fit` names the agents that fit.
-    needs_masks = entry is not None and entry.needs_masks and has_masks(env)
+    needs_masks = entry is not None and entry.needs_masks and wrappers.has_masks(env)
     with as_user_error("mask_actions", ValueError):
         is_masked = spec.algorithm.get("mask_actions", False) or needs_masks
-        return ActionMasks(env) if is_masked else env
+        return wrappers.ActionMasks(env) if is_masked else env
 
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> Env:

@@ -129,6 +129,8 @@ def plain(value: Any, infinities: Mapping[float, str] | None = None) -> Any:
             return None if math.isnan(value) else (infinities or {}).get(value, float(value))
         case None | bool() | int() | str():
             return value
+        case Path():
+            return str(value)
         case _:
             return plain(value.tolist(), infinities)  # of NumPy
 

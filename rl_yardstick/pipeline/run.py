@@ -25,15 +25,8 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline import files
 from rl_yardstick.pipeline.errors import Stopped, UserError, as_user_error
-from rl_yardstick.pipeline.files import (
-    MAX_TABLE,
-    read_bytes,
-    read_json,
-    replacing,
-    write_json,
-    write_text,
-)
 from rl_yardstick.pipeline.spec import TrainSpec
 
 RUNNING, FINISHED, INTERRUPTED, FAILED = "running", "finished", "interrupted", "failed"
@@ -129,7 +122,7 @@ class Run:
     def recorded(self) -> dict[str, Any]:
         """The content of ``run.json``; empty if there is none yet."""
         path = self.path / RECORD
-        data = read_json(path, MAX_RECORD) if path.exists() else {}
+        data = files.read_json(path, MAX_RECORD) if path.exists() else {}
         return data if isinstance(data, dict) else {}
 
     def spec(self) -> TrainSpec:
@@ -151,15 +144,15 @@ class Run:
         for name, data in (("config.yml", spec.hyperparams), ("args.yml", args)):
             plain = json.loads(json.dumps(data, default=str))  # no paths
             text = yaml.dump(plain, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper))
-            write_text(settings / name, text)
-        write_text(settings / "command.txt", f"{command}\n")
+            files.write_text(settings / name, text)
+        files.write_text(settings / "command.txt", f"{command}\n")
         self.record(spec, RUNNING)
 
     def record(self, spec: TrainSpec, state: str, **figures: Any) -> None:
         """Write ``run.json``; with the state ``finished`` it is the last file of a run."""
         known = {"state": state, "env_name": spec.env_name, "spec": spec.model_dump()}
         facts = {"versions": versions(), "machine": machine(), "pid": os.getpid()}
-        write_json(self.path / RECORD, {**known, **facts, **figures})
+        files.write_json(self.path / RECORD, {**known, **facts, **figures})
 
 
 def save_agent(agent: Any, path: Path, buffer: Path | None = None) -> None:
@@ -167,13 +160,13 @@ def save_agent(agent: Any, path: Path, buffer: Path | None = None) -> None:
     from rl_yardstick.pipeline.finite_numbers import check_model
 
     check_model(agent)
-    with replacing(path) as beside:
+    with files.replacing(path) as beside:
         agent.save(beside)
     if (statistics := agent.get_vec_normalize_env()) is not None:
-        with replacing(statistics_beside(path)) as beside:
+        with files.replacing(statistics_beside(path)) as beside:
             statistics.save(str(beside))
     if buffer is not None and getattr(agent, "replay_buffer", None) is not None:
-        with replacing(buffer) as beside:
+        with files.replacing(buffer) as beside:
             agent.save_replay_buffer(beside)
 
 
@@ -195,14 +188,15 @@ class Episodes:
     seconds: Floats  # time since the beginning
 
 
-def read_episodes(folder: Path, limit: int = MAX_TABLE) -> Episodes:
+def read_episodes(folder: Path, limit: int = files.MAX_TABLE) -> Episodes:
     """Read the training episodes in Monitor's files, each of at most ``limit`` bytes."""
-    tables, columns = [], {"delimiter": ",", "usecols": (0, 1, 2)}  # wrappers may add others
+    tables = []
+    form: Any = {"delimiter": ",", "skiprows": 2, "usecols": (0, 1, 2), "ndmin": 2}
     for path in sorted(folder.glob("*.monitor.csv")):
-        content = BytesIO(read_bytes(path, limit))
+        content = BytesIO(files.read_bytes(path, limit))
         with as_user_error(f"{path} is damaged", ValueError), catch_warnings(action="ignore"):
             # Without an episode it has two lines, and NumPy warns.
-            tables.append(np.loadtxt(content, skiprows=2, ndmin=2, **columns).reshape(-1, 3))
+            tables.append(np.loadtxt(content, **form).reshape(-1, 3))
     if not tables:
         raise UserError(f"{folder} has no 0.monitor.csv")
     return joined_episodes(tables)

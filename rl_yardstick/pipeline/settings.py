@@ -22,13 +22,7 @@ import yaml
 
 from rl_yardstick.agents.own_classes import SMALLEST, fault_of
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.pipeline.components import (
-    AUTO,
-    WRAPPERS,
-    arguments_of,
-    check_arguments,
-    digests_of,
-)
+from rl_yardstick.pipeline import components
 from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknown
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec, validated
@@ -134,7 +128,7 @@ def read_entry(
         named = [registry[name] for name in entries if name in registry]
         same = [s.id for s in named if (s.entry_point, s.kwargs, s.max_episode_steps) == meant]
         key = same[0] if same else key
-    if key is None and not {*arguments_of(algo), *SPECIAL}.isdisjoint(entries):
+    if key is None and not {*components.arguments_of(algo), *SPECIAL}.isdisjoint(entries):
         with as_user_error(f"{path}: these are no hyperparameters", TypeError, LookupError):
             return from_trial(algo, entries)  # one without an id, as in rl_zoo3's config.yml
     if key is None:
@@ -364,23 +358,24 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
     if "noise_type" not in entry:  # then noise_std is an argument of some agents
         special.pop("noise_std", None)
     rest = {key: value for key, value in entry.items() if key not in special}
+    known = [*components.arguments_of(algo), *SPECIAL]
     for key in rest:
         if key in _SET_ELSEWHERE:
             raise UserError(f"{key} is set by {_SET_ELSEWHERE[key]}, not here")
-        if key not in arguments_of(algo):
-            raise unknown(f"{algo} has no hyperparameter", key, [*arguments_of(algo), *SPECIAL])
-    for key in WRAPPERS:
+        if key not in known:
+            raise unknown(f"{algo} has no hyperparameter", key, known)
+    for key in components.WRAPPERS:
         if special.get(key) is not None:
-            special[key] = check_arguments(key, special[key], f"{key}: ")
-    algorithm = check_arguments(algo, rest)
+            special[key] = components.check_arguments(key, special[key], f"{key}: ")
+    algorithm = components.check_arguments(algo, rest)
     if special.get("normalize") is not None and isinstance(algorithm.get("gamma"), float):
         # As in rl_zoo3, rewards are normalised with the agent's discount.
         special["normalize"].setdefault("gamma", algorithm["gamma"])
-    asked = [key for key in AUTO if algorithm.get(key) == "auto"]
+    asked = [key for key in components.AUTO if algorithm.get(key) == "auto"]
     plain = {key: value for key, value in algorithm.items() if key not in asked}
     if str(special.get("n_timesteps")).startswith("auto"):
         asked.insert(0, str(special.pop("n_timesteps")))
-    code = digests_of(fields.get("gym_packages", ()), algo, env_id)
+    code = components.digests_of(fields.get("gym_packages", ()), algo, env_id)
     found = {"algo": algo, "env_id": env_id, "algorithm": plain, "code": code}
     found |= {**special, **fields}
     spec = validated(found)

@@ -12,17 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib import ticker
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.textpath import TextToPath
-from matplotlib.ticker import (
-    EngFormatter,
-    FixedLocator,
-    FuncFormatter,
-    NullLocator,
-    PercentFormatter,
-)
 from matplotlib.transforms import offset_copy
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis
@@ -219,7 +213,7 @@ def draw_rewards(upper: Axes, lower: Axes, series: PullSeries, place: str, marks
     )
     lower.set_ylim(0, 1)
     _draw_lines(lower, _by_pull(series, "optimal", marks))
-    lower.yaxis.set_major_formatter(PercentFormatter(1))
+    lower.yaxis.set_major_formatter(ticker.PercentFormatter(1))
     lettering(lower, x="pulls", y="runs that pull a best arm")
     shared_legend(upper, lower)
 
@@ -290,7 +284,7 @@ def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
         names = [name.replace(", ", "\n" if upright else ", ") for name in arms.names]
         axes.set_xticks(places, names, rotation=0 if upright else 90)
     upper.set_ylim(0, 1)
-    upper.yaxis.set_major_formatter(PercentFormatter(1))
+    upper.yaxis.set_major_formatter(ticker.PercentFormatter(1))
     lettering(upper, title="pulls, by context", y="share of the pulls")
     title = "final estimates, mean and spread over runs; lines across are the truth"
     lettering(lower, title=title, y="mean reward per pull")
@@ -370,7 +364,7 @@ def draw_learning_curves(places: Sequence[Axes], one: EnvironmentSeries, marks: 
         else:
             _draw_references(axes, environment)
         lettering(axes, title=title, x=_AXES[by], y=f"return{words}")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
     if on_variant:  # the legend's entry for the circles
         places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
     shared_legend(*places, n_bands=len(environment.agents))
@@ -393,10 +387,10 @@ def _set_scale(axes: Axes, linear_up_to: float | None) -> str:
     if linear_up_to is None:
         return ""
     axes.set_yscale("symlog", linthresh=linear_up_to)
-    axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(linear_up_to)))
-    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_locator(ticker.FixedLocator(symlog_ticks(linear_up_to)))
+    axes.yaxis.set_minor_locator(ticker.NullLocator())
     # With the minus sign of Matplotlib's own axes.
-    signed = FuncFormatter(lambda value, _: number(value).replace("-", "\N{MINUS SIGN}"))
+    signed = ticker.FuncFormatter(lambda value, _: number(value).replace("-", "\N{MINUS SIGN}"))
     axes.yaxis.set_major_formatter(signed)
     return f" (log scale beyond ±{number(linear_up_to)})"
 
@@ -475,9 +469,9 @@ def draw_sweeps(axes: Axes, one: EnvironmentSeries, metric: str) -> None:
         x, y = np.transpose(rings)
         axes.scatter(x, y, 90, "none", edgecolor="black", label=label, zorder=3)
     if len(values) <= MOST_TICKS:
-        axes.xaxis.set_major_locator(FixedLocator(_ticks_apart(axes, values)))
-        axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
+        axes.xaxis.set_major_locator(ticker.FixedLocator(_ticks_apart(axes, values)))
+        axes.xaxis.set_minor_locator(ticker.NullLocator())
+    axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:.4g}"))
     across = names[0] if len(names) == 1 else "value of the parameter"
     lettering(axes, title=environment.environment, x=across + words, y=METRIC_WORDS[metric])
     is_there = any(np.isfinite(sweep.means.low).any() for sweep in sweeps.values())
@@ -561,7 +555,7 @@ def write_figures(series: StudySeries) -> list[Path]:
                 style = line_style(series.marks[agent])
                 axes.plot(overall.thresholds, shares, label=agent, linewidth=1.5, **style)
             axes.set_ylim(0, 1.02)
-            axes.yaxis.set_major_formatter(PercentFormatter(1))
+            axes.yaxis.set_major_formatter(ticker.PercentFormatter(1))
             title = "Performance profiles over environments"
             lettering(axes, title=title, x="score", y="share of runs with a higher score")
             shared_legend(axes)

@@ -31,14 +31,8 @@ from rl_yardstick.experiments.plan import PlannedRun, plan
 from rl_yardstick.experiments.results import read_run
 from rl_yardstick.pipeline.errors import UserError, as_user_error, shown
 from rl_yardstick.pipeline.files import plain
+from rl_yardstick.tuning import suggesting
 from rl_yardstick.tuning.search_spaces import read_search_space
-from rl_yardstick.tuning.suggesting import (
-    SeededSampler,
-    Suggestions,
-    name_of,
-    planned_runs,
-    shipped_entry,
-)
 from rl_yardstick.tuning.tuning_spec import AUTO, STEPS, TuningSpec
 
 OWN_FILE = "trials.log"
@@ -190,7 +184,7 @@ class Search:
     tuning: TuningSpec
     root: Path  #: its folder
     study: Study  #: Optuna's study
-    suggestions: Suggestions  #: the settings of its trials
+    suggestions: suggesting.Suggestions  #: the settings of its trials
     #: called with the number of each trial that ends, its value (None if it was pruned or failed),
     #: and the reason of a failure
     tell: Callable[[int, float | None, str], None] = lambda *_: None
@@ -214,7 +208,7 @@ class Search:
     def n_at_optimum(self) -> int:
         """Number of settings that have the optimal score on all seeds of the search."""
         found = {
-            name_of(trial.user_attrs[SETTINGS])
+            suggesting.name_of(trial.user_attrs[SETTINGS])
             for trial in self.trials
             if (runs := outcomes_of(trial)).keys() == {*self.tuning.seeds}
             and all(run.steps is not None for run in runs.values())
@@ -269,7 +263,7 @@ class Search:
             new.trial.set_user_attr(SETTINGS, plain(entry))
             self._trials.append(new)
             try:
-                new.to_do = planned_runs(self.tuning, self.root, entry)
+                new.to_do = suggesting.planned_runs(self.tuning, self.root, entry)
                 return new
             except UserError as error:
                 self._fail(new, str(error))
@@ -344,7 +338,7 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
         is_bandit = ALGORITHMS[agent.algo].for_bandits
         tuning = replace(tuning, figure="regret" if is_bandit else "score")
     space = read_search_space(agent.algo, tuning.environment.env_id, tuning.search_space)
-    suggestions = Suggestions(tuning, space, shipped_entry(run.spec))
+    suggestions = suggesting.Suggestions(tuning, space, suggesting.shipped_entry(run.spec))
     if not suggestions.n_free:
         raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
     suggestions.check(root)
@@ -352,7 +346,7 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
     study = optuna.create_study(
         study_name=tuning.study.name,
         storage=open_storage(root),
-        sampler=SeededSampler(tuning),
+        sampler=suggesting.SeededSampler(tuning),
         pruner=optuna.pruners.NopPruner(),  # `is_hopeless` decides
         direction="minimize" if tuning.is_cost else "maximize",
         load_if_exists=True,

@@ -155,10 +155,13 @@ def write_learning_page(spec: TrainSpec, recorder: Watch, path: Path, title: str
     The default title names the agent and the environment.
     """
     place = place_data(spec, recorder)
-    heading = {"title": title or f"{spec.algo} on {spec.place}", "seed": spec.seed}
+    page = frame.templates("learning").get_template("learning.html")
+    scripts = [f"learning/learning_{name}.js" for name in SCRIPTS]
+    around = frame.page_frame(scripts, ("page.css", "learning/learning.css"), is_plotted=False)
+    around |= {"title": title or f"{spec.algo} on {spec.place}", "seed": str(spec.seed)}
     for data in _ever_less(recorder):
-        words = page_words(spec, data)
-        text = _render({**heading, **words}, {**data, **place})
+        words, packed = page_words(spec, data), frame.packed(frame.as_json(data | place, exactly))
+        text = page.render(**around, **words, data=packed)
         if len(text.encode()) <= MOST_BYTES:
             break
     write_text(path, text)
@@ -177,16 +180,6 @@ def _ever_less(recorder: Watch) -> Iterator[dict[str, Any]]:
     while n_steps:
         yield steps_data(recorder, n_steps)
         n_steps = n_steps * 3 // 4
-
-
-def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
-    data_text = frame.packed(frame.as_json(data, exactly))
-    scripts = [f"learning/learning_{name}.js" for name in SCRIPTS]
-    styles = ("page.css", "learning/learning.css")
-    template = frame.templates("learning").get_template("learning.html")
-    return template.render(
-        **words, data=data_text, **frame.page_frame(scripts, styles, is_plotted=False)
-    )
 
 
 # The first training of each agent of a study, repeated to be recorded.
