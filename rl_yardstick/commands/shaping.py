@@ -78,7 +78,6 @@ def main() -> int:
 
 
 def _spec(args: argparse.Namespace) -> TrainSpec:
-    """The settings of the agent, with the changes in training."""
     from rl_yardstick.pipeline.environments import check_env_id, with_files_read
     from rl_yardstick.pipeline.settings import check_agent, parse_assignments, read_spec
 

@@ -244,7 +244,6 @@ def whole_zip(path: Path) -> str:
 
 
 def _statistics(args: argparse.Namespace) -> str | None:
-    """The absolute path of ``--vec-normalize``, or ``none``."""
     path = args.vec_normalize
     if path is not None and not args.trained_agent:
         raise UserError("--vec-normalize needs --trained-agent")

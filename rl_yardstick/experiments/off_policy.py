@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from scipy import special
+from scipy import linalg, special
 
 from rl_yardstick.envs.bandits import LoggedData, read_log
 from rl_yardstick.mdp.transition_model import Floats, Ints
@@ -68,8 +68,6 @@ def arm_regressions(
 
     Source: Hoerl and Kennard (1970), "Ridge regression", Technometrics 12.
     """
-    from scipy import linalg
-
     centre, scale = contexts.mean(axis=0), contexts.std(axis=0)
     scale[scale == 0] = 1
     known, inputs = (

@@ -217,7 +217,6 @@ STEPS_OF_EPISODE = 100
 
 
 def _quickened(spec: TrainSpec, quick: QuickSpec) -> dict[str, int]:
-    """A small budget, in the unit of the spec's own."""
     entry = ALGORITHMS[spec.algo]
     is_table = entry.family != "library" and "compiled" in entry.engines
     steps = QUICK_TABLE_STEPS if is_table else QUICK_STEPS

@@ -85,8 +85,7 @@ def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
 
 
 def _labels(planned: PlannedRun, kind: str) -> Curve:
-    labels = (planned.agent, planned.environment, planned.seed, kind)
-    return dict(zip(_LABELS, labels, strict=True))
+    return dict(zip(_LABELS, (*planned.labels, planned.seed, kind), strict=True))
 
 
 def joined(curves: Sequence[Curve]) -> pd.DataFrame:
@@ -217,7 +216,6 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
 
 
 def _batch_rows(planned: PlannedRun, recorded: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Make a row of the summary for each run of a batch."""
     pulls = PullStatistics.load(planned.path / STATISTICS_FILE)
     shared = {
         "n_timesteps": planned.spec.n_timesteps,

@@ -424,7 +424,6 @@ def check_arguments(owner: str, values: Any, where: str = "") -> dict[str, Any]:
 
 
 def _checked(name: str, value: Any, kinds: list[str]) -> Any:
-    """The value, converted to one of the kinds."""
     if name == "train_freq" and not isinstance(value, list | tuple):  # or [4, "episode"]
         kinds = ["int"]
     if "any" in kinds or (value is None and "None" in kinds):

@@ -11,10 +11,13 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
 import rl_yardstick.envs  # noqa: F401  # registers this project's environments
 from rl_yardstick.agents.registry import ALGORITHMS, fitting_algorithms, is_bandit
 from rl_yardstick.envs import wrappers
+from rl_yardstick.envs.bandits.logged import ReplayBandit
+from rl_yardstick.envs.grid import GridWorld, read_rows
 from rl_yardstick.pipeline.components import build, import_modules, split_id
 from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line, shown, unknown
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -64,7 +67,6 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> Env:
 
 
 def _parameters(env_id: str) -> Mapping[str, inspect.Parameter]:
-    """The arguments of the class or function that makes an environment."""
     with suppress(ImportError, AttributeError, TypeError, ValueError, gym.error.Error):
         return inspect.signature(creator_of(env_id)).parameters
     return {}
@@ -258,11 +260,6 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
     So a run does not depend on the folder in which it was started.
     """
-    from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
-
-    from rl_yardstick.envs.bandits.logged import ReplayBandit
-    from rl_yardstick.envs.grid import GridWorld, read_rows
-
     found = dict(entry)
     for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
         kwargs: Any = found.get(key) if isinstance(found.get(key), dict) else {}
@@ -277,8 +274,6 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def map_name(env_id: str, entry: Mapping[str, Any]) -> str:
     """The file name of the grid world map that is evaluated on; empty if it is in no file."""
-    from rl_yardstick.envs.grid import GridWorld
-
     parts = [entry.get(key) or {} for key in ("eval_env_kwargs", "env_kwargs")]
     given: Any = next((part["desc"] for part in parts if "desc" in part), None)
     is_path = isinstance(given, str) and "\n" not in given and _makes(env_id, GridWorld)

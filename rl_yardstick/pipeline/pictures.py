@@ -374,7 +374,6 @@ def _scaled(ends: tuple[float, float], names: tuple[str, ...]) -> tuple[Normaliz
 
 
 def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar: str) -> None:
-    """Draw both sides, with a colour bar for one of them."""
     from matplotlib.cm import ScalarMappable
 
     found = sides[0].shown
@@ -454,7 +453,6 @@ def _panels(layout: GridLayout, n_layers: int) -> tuple[Figure, list[list[Axes]]
 
 
 def _legend(found: ValueMap, scale: Normalize) -> Iterator[Artist]:
-    """Make a legend entry for each kind of mark in the picture."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

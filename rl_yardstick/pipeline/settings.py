@@ -18,11 +18,12 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
 
 from rl_yardstick.agents.own_classes import SMALLEST, fault_of
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.pipeline import components
+from rl_yardstick.pipeline import components, environments
 from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknown
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec, validated
@@ -117,15 +118,13 @@ def read_entry(
     is used: for CliffWalking-v1 with ``is_slippery: True``, the entry of CliffWalkingSlippery-v1.
     Another file may also be a single entry, or the parameters of a trial; see `from_trial`.
     """
-    from gymnasium import registry
-
     if (entries := _read_file(algo, path)) is None:
         return {}
-    key, own = _key(entries, env_id), registry.get(env_id)
+    key, own = _key(entries, env_id), gym.registry.get(env_id)
     path = path or HYPERPARAMS / f"{algo}.yml"
     if env_kwargs and own is not None:
         meant = own.entry_point, {**own.kwargs, **env_kwargs}, own.max_episode_steps
-        named = [registry[name] for name in entries if name in registry]
+        named = [gym.registry[name] for name in entries if name in gym.registry]
         same = [s.id for s in named if (s.entry_point, s.kwargs, s.max_episode_steps) == meant]
         key = same[0] if same else key
     if key is None and not {*components.arguments_of(algo), *SPECIAL}.isdisjoint(entries):
@@ -358,12 +357,12 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
     if "noise_type" not in entry:  # then noise_std is an argument of some agents
         special.pop("noise_std", None)
     rest = {key: value for key, value in entry.items() if key not in special}
-    known = [*components.arguments_of(algo), *SPECIAL]
+    known = components.arguments_of(algo)
     for key in rest:
         if key in _SET_ELSEWHERE:
             raise UserError(f"{key} is set by {_SET_ELSEWHERE[key]}, not here")
         if key not in known:
-            raise unknown(f"{algo} has no hyperparameter", key, known)
+            raise unknown(f"{algo} has no hyperparameter", key, [*known, *SPECIAL])
     for key in components.WRAPPERS:
         if special.get(key) is not None:
             special[key] = components.check_arguments(key, special[key], f"{key}: ")
@@ -420,17 +419,14 @@ _STEPS = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
 def _with_numbers(spec: TrainSpec, asked: list[str]) -> TrainSpec:
     """Settings of tables, from the evaluation environment."""
-    from gymnasium.spaces import Discrete
-
     from rl_yardstick.envs.known_models import time_limit, transition_model
-    from rl_yardstick.pipeline.environments import check_fit, make_single_env
 
-    check_fit(spec)
+    environments.check_fit(spec)
     where, n_timesteps = f"{spec.algo} on {spec.env_id}", spec.n_timesteps
     origins, algorithm = dict(spec.origins), dict(spec.algorithm)
-    with closing(make_single_env(spec)) as env:
+    with closing(environments.make_single_env(spec)) as env:
         spaces = env.observation_space, env.action_space
-        counts = [int(space.n) for space in spaces if isinstance(space, Discrete)]
+        counts = [int(space.n) for space in spaces if isinstance(space, gym.spaces.Discrete)]
         if len(counts) < 2:
             raise UserError(f"{where}: auto needs Discrete observations and actions")
         n_pairs = counts[0] * counts[1]
@@ -468,14 +464,13 @@ def _with_numbers(spec: TrainSpec, asked: list[str]) -> TrainSpec:
 def _with_rewards(spec: TrainSpec) -> TrainSpec:
     """The arguments of training wrappers, from the rewards that reach them."""
     from rl_yardstick.envs.known_models import transition_model
-    from rl_yardstick.pipeline.environments import make_single_env
 
     wrappers, told = list(spec.train_env_wrapper), []
     for place, wrapper in enumerate(wrappers):
         kwargs = dict(wrapper.kwargs)
         for key in [key for key in ("scale", "min_reward") if kwargs.get(key) == "auto"]:
             inner = spec.changed(train_env_wrapper=wrappers[:place])
-            with closing(make_single_env(inner, training=True)) as env:
+            with closing(environments.make_single_env(inner, training=True)) as env:
                 model = transition_model(env)
             if model is None:
                 raise UserError(f"{spec.env_id}: {key}: auto needs an environment with a model")

@@ -219,7 +219,6 @@ def draw_rewards(upper: Axes, lower: Axes, series: PullSeries, place: str, marks
 
 
 def _by_pull(series: PullSeries, what: str, marks: Marks) -> list[Line]:
-    """A statistic as a line for each agent that has it."""
     found = [(agent, p, getattr(p, what)) for agent, p in series.pulls.items()]
     known = [one for one in found if np.isfinite(one[-1]).any()]
     return [(agent, p.pulls, y, line_style(marks[agent])) for agent, p, y in known]

@@ -9,22 +9,20 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.results import StudyResults
 from rl_yardstick.experiments.study import file_name
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.environments import MISTAKES
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.files import replacing, write_json
+from rl_yardstick.pipeline.models import Which, load_agent, model_of_run
 from rl_yardstick.pipeline.run import RECORD, read_episodes
-
-if TYPE_CHECKING:
-    from rl_yardstick.experiments.results import StudyResults
-    from rl_yardstick.pipeline.models import Which
 
 FILM = "episode.gif"
 MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
@@ -94,7 +92,6 @@ def _loaded(planned: PlannedRun, which: Which = "final") -> Iterator[tuple[Any, 
     """An agent of a run, and an environment that draws pictures without a display."""
     import torch as th
 
-    from rl_yardstick.pipeline.models import load_agent, model_of_run
     from rl_yardstick.pipeline.playing import playing_env
 
     import_modules(planned.spec.gym_packages)

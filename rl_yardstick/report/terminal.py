@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import pandas as pd
 from rich.console import Console
@@ -14,14 +13,11 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from rl_yardstick.experiments.off_policy import difference_in_value, mean_reward
+from rl_yardstick.experiments.off_policy import Comparison, difference_in_value, mean_reward
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.study import StudySpec
 from rl_yardstick.report import ranking, words
 from rl_yardstick.verdicts import FEW, Estimate
-
-if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
-    from rl_yardstick.experiments.off_policy import Comparison
 
 MOST_AGENT_WIDTH, LEAST_AGENT_WIDTH = 20, 12
 UNBOUNDED = 10_000  # columns

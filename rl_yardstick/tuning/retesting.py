@@ -122,7 +122,6 @@ def is_settled(said: Study) -> bool:
 
 
 def _against_shipped(said: Study) -> dict[str, Pair]:
-    """The other settings, compared with the shipped ones."""
     pairs = [one for pair in said.pairs for one in (pair, pair.swapped())]
     return {pair.first: pair for pair in pairs if pair.second == SHIPPED}
 

@@ -316,8 +316,7 @@ class Search:
                 raise UserError(f"all of the first {MOST_FAILURES} trials failed; {reason}")
 
     def _end(self, each: _UnderWay, value: float | None, reason: str = "") -> None:
-        """End a trial; without a value if it was pruned or failed."""
-        state = TrialState.PRUNED if value is None else TrialState.COMPLETE
+        state = TrialState.PRUNED if value is None else TrialState.COMPLETE  # or it has failed
         self.study.tell(each.trial, value, state)
         each.is_over = True
         self._trials.remove(each)
