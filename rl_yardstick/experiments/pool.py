@@ -95,13 +95,11 @@ def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
     if stop is not None:
         yield stop
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    stop = Stop().listen()
-    signal.signal(signal.SIGINT, before[signal.SIGINT])
+    before = signal.getsignal(signal.SIGTERM)
     try:
-        yield stop
+        yield Stop().listen(signal.SIGTERM)
     finally:
-        signal.signal(signal.SIGTERM, before[signal.SIGTERM])
+        signal.signal(signal.SIGTERM, before)
 
 
 # --- workers on this machine ----------------------------------------------------------------------

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import dataclasses as checked
 
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.pipeline.components import arguments_of
@@ -79,6 +80,20 @@ def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
     return override(settings, {**changes, **merged})
 
 
+def _number(value: Any) -> Any:
+    """YAML reads 1e5 as text, and Python counts True as 1."""
+    if isinstance(value, bool):
+        raise ValueError(f"must be a number, not {shown(value)}")
+    with suppress(ValueError):
+        return float(value) if isinstance(value, str) else value
+    return value
+
+
+_Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
+_FromZero = Annotated[int, BeforeValidator(_number), Field(ge=0)]
+_Float = Annotated[float, BeforeValidator(_number)]
+
+
 @dataclass(frozen=True)
 class AgentSpec:
     """One of the compared agents."""
@@ -114,12 +129,13 @@ class EnvironmentSpec:
         return file_name(self.env_id.replace("/", "-") if is_id else self.label)
 
 
-@dataclass(frozen=True)
+@checked.dataclass(frozen=True, config={"extra": "forbid"})
 class QuickSpec:
     """The reduction of a study for a quick look."""
 
-    seeds: int | None = None  #: None for 2, or 1 with more than `MOST_PAIRS`
-    budget: float | None = None  #: share of each run's budget; None: see `plan.QUICK_STEPS`
+    seeds: _Count | None = None  #: None for 2, or 1 with more than `MOST_PAIRS`
+    #: The share of each run's budget; None: see `plan.QUICK_STEPS`.
+    budget: Annotated[_Float, Field(gt=0, le=1)] | None = None
 
 
 @dataclass(frozen=True)
@@ -208,15 +224,6 @@ def _as_texts(values: Sequence[Any]) -> list[str]:
 # --- study files ----------------------------------------------------------------------------------
 
 
-def _number(value: Any) -> Any:
-    """YAML reads 1e5 as text, and Python counts True as 1."""
-    if isinstance(value, bool):
-        raise ValueError(f"must be a number, not {shown(value)}")
-    with suppress(ValueError):
-        return float(value) if isinstance(value, str) else value
-    return value
-
-
 def _seconds(value: Any) -> Any:
     """A time such as 90, 90s, 10m, 2h or 1d."""
     found = re.fullmatch(r"(\d*\.?\d+)\s*(|s|m|min|h|d)", str(value).strip())
@@ -239,9 +246,6 @@ def _by_label(value: Any) -> Any:
     return {key: entry or {} for key, entry in value.items()} if isinstance(value, dict) else value
 
 
-_Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
-_FromZero = Annotated[int, BeforeValidator(_number), Field(ge=0)]
-_Float = Annotated[float, BeforeValidator(_number)]
 _Sweep = dict[str, Annotated[list[Any], Field(min_length=1)]]
 
 
@@ -279,11 +283,6 @@ class _Seeds(_Part):
     count: _Count = 10
 
 
-class _Quick(_Part):
-    seeds: _Count | None = None
-    budget: Annotated[_Float, Field(gt=0, le=1)] | None = None
-
-
 class _File(_Part):
     title: str = ""
     description: str = ""
@@ -294,7 +293,7 @@ class _File(_Part):
     ] = _Seeds()
     settings: dict[str, Any] = {}
     sweep: _Sweep = {}
-    quick: _Quick = _Quick()
+    quick: QuickSpec = QuickSpec()
     n_timesteps: _Count | None = None
     n_episodes: _Count | None = None
     tuned: bool = True
@@ -313,7 +312,7 @@ _LISTS = ("agents", "environments")
 # Keys that mean the same as fields of `StudySpec`.
 _SAME = (
     *("description", "eval_freq", "eval_episodes", "metric", "margin", "shared_randomness"),
-    *("threshold", "episodes_table", "diagnose", "run_timeout"),
+    *("threshold", "episodes_table", "diagnose", "run_timeout", "quick"),
 )
 
 
@@ -364,12 +363,11 @@ def read_study(path: Path) -> StudySpec:
         environments=tuple(environments),
         n_seeds=file.seeds.count,
         first_seed=file.seeds.first,
-        quick=QuickSpec(file.quick.seeds, file.quick.budget),
         **{key: getattr(file, key) for key in _SAME},
     )
 
 
-_PARTS: Mapping[tuple[str, ...], type[_Part]] = {(): _File, ("quick",): _Quick, ("seeds",): _Seeds}
+_PARTS: Mapping[tuple[str, ...], Any] = {(): _File, ("quick",): QuickSpec, ("seeds",): _Seeds}
 
 
 def _in_one_line(path: Path, error: ValidationError) -> UserError:
@@ -377,8 +375,8 @@ def _in_one_line(path: Path, error: ValidationError) -> UserError:
     first = error.errors()[0]
     *outer, key = [str(key) for key in first["loc"] if key != "[key]"]
     place, value = ": ".join([str(path), *outer]), first["input"]
-    if first["type"] == "extra_forbidden":
-        return unknown(f"{place}: unknown key", key, _PARTS[tuple(outer)].model_fields)
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        return unknown(f"{place}: unknown key", key, _PARTS[tuple(outer)].__pydantic_fields__)
     if first["type"] == "literal_error":
         return unknown(f"{place}: unknown {key}", str(value), METRICS)
     if first["type"] == "value_error":

@@ -313,9 +313,15 @@ def action_noise(spec: TrainSpec, actions: Any) -> dict[str, Any]:
 
 TABLE = Path(__file__).parents[1] / "hyperparams" / "arguments.json"
 
-# Arguments that a flag or another key sets.
-_SET_ELSEWHERE = {"env", "seed", "device", "verbose", "tensorboard_log", "action_noise"}
-_INTERNAL = {"self", "_init_setup_model", "venv", "filename"}
+# Arguments that a flag or another key sets; rl_zoo3's files have some of them.
+SET_ELSEWHERE = {
+    "action_noise": "noise_type and noise_std",
+    "tensorboard_log": "--tensorboard-log",
+    "seed": "--seed",
+    "device": "--device",
+    "verbose": "--verbose",
+}
+_INTERNAL = {"self", "env", "_init_setup_model", "venv", "filename"}
 _PLAIN = {"bool": bool, "int": int, "float": float, "str": str, "dict": dict, "list": list}
 _WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a text"}
 _WORDS |= {"schedule": "a schedule such as lin_0.001", "dict": "a mapping", "list": "a list"}
@@ -367,7 +373,7 @@ def read_signature(name: str) -> dict[str, list[str]]:
         getattr(importlib.import_module(module), cls) if module else load_algorithm(name)
     )
     kinds = {name: sorted(_kinds(p.annotation, p.default)) for name, p in found.items()}
-    return {name: kinds[name] for name in kinds if name not in _SET_ELSEWHERE | _INTERNAL}
+    return {name: kinds[name] for name in kinds if name not in {*SET_ELSEWHERE, *_INTERNAL}}
 
 
 def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import re
@@ -41,10 +40,10 @@ class Stop:
 
     number = 0  # of the first signal
 
-    def listen(self) -> Self:
+    def listen(self, *numbers: int) -> Self:
         """Take over the signals, in a process's main thread; elsewhere Python delivers none."""
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in numbers or (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, self._noticed)
         return self
 
@@ -142,9 +141,8 @@ class Run:
         # rl_zoo3's tools use env_kwargs in args.yml before those in config.yml.
         args = {**args, "env_kwargs": spec.env_kwargs or None}
         for name, data in (("config.yml", spec.hyperparams), ("args.yml", args)):
-            plain = json.loads(json.dumps(data, default=str))  # no paths
-            text = yaml.dump(plain, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper))
-            files.write_text(settings / name, text)
+            dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+            files.write_text(settings / name, yaml.dump(files.plain(data), Dumper=dumper))
         files.write_text(settings / "command.txt", f"{command}\n")
         self.record(spec, RUNNING)
 

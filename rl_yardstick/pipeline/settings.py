@@ -35,14 +35,6 @@ COMPONENTS = ("env_wrapper", "train_env_wrapper", "vec_env_wrapper", "callback")
 ENV_KWARGS = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 _OTHERS = ("n_envs", "normalize", "frame_stack", "monitor_kwargs", "noise_type", "noise_std")
 SPECIAL = (*BUDGETS, *COMPONENTS, *ENV_KWARGS, *_OTHERS)
-# What rl_zoo3's files have and what is decided elsewhere here.
-_SET_ELSEWHERE = {
-    "action_noise": "noise_type and noise_std",
-    "tensorboard_log": "--tensorboard-log",
-    "seed": "--seed",
-    "device": "--device",
-    "verbose": "--verbose",
-}
 _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 
 
@@ -359,8 +351,8 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
     rest = {key: value for key, value in entry.items() if key not in special}
     known = components.arguments_of(algo)
     for key in rest:
-        if key in _SET_ELSEWHERE:
-            raise UserError(f"{key} is set by {_SET_ELSEWHERE[key]}, not here")
+        if key in components.SET_ELSEWHERE:
+            raise UserError(f"{key} is set by {components.SET_ELSEWHERE[key]}, not here")
         if key not in known:
             raise unknown(f"{algo} has no hyperparameter", key, [*known, *SPECIAL])
     for key in components.WRAPPERS:

@@ -250,6 +250,11 @@ class Conclusion(NamedTuple):
     # Failures, how soon agents arrive, training on variants, missing runs, the number of looks.
     notes: tuple[str, ...]
 
+    @property
+    def everything(self) -> tuple[str, ...]:
+        """All sentences."""
+        return (self.lead, *self.pairs, *self.notes)
+
 
 def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion:
     """What a study has shown on one environment."""
