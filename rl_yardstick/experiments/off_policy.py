@@ -31,6 +31,7 @@ from scipy import linalg, special
 from rl_yardstick.envs.bandits import LoggedData, read_log
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line
+from rl_yardstick.pipeline.models import Wanted, find_model, load_agent
 from rl_yardstick.verdicts import Estimate
 
 if TYPE_CHECKING:
@@ -338,8 +339,6 @@ def load_policy(path: Path, typed: Sequence[str] = ()) -> LoggedPolicy:
     Raises:
         UserError: if there is none, or it does not observe the log's contexts.
     """
-    from rl_yardstick.pipeline.models import Wanted, find_model, load_agent
-
     wanted = Wanted(path, env_id="ReplayBandit-v0", typed=list(typed), device="cpu")
     model = find_model(wanted)
     # Settings that change an agent's observations, so that they differ from the log's contexts.

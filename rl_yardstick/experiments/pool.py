@@ -19,6 +19,7 @@ from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 from pebble import ProcessExpired, ProcessPool
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -153,8 +154,6 @@ REGISTRATIONS: dict[str, Callable[[], object]] = {}
 
 def registrations() -> bytes:
     """The registrations, as cloudpickle copies code that stands in no module."""
-    import cloudpickle
-
     classes = [partial(name_of, cls) for cls in BY_VALUE.values()]
     return bytes(cloudpickle.dumps([*classes, *REGISTRATIONS.values()]))
 

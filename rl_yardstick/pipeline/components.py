@@ -205,8 +205,6 @@ def build(
     component: Component, base: type, where: str, typed: list[str], folder: Path | None, *inner: Any
 ) -> Any:
     """An object of a wrapper or callback, around ``inner``; it may write into ``folder`` alone."""
-    from gymnasium.error import Error
-
     place = f"{where}: {component.name}"
     cls = find_class(component.name, (base,), where, typed)
     names = [*inspect.signature(cls).parameters]
@@ -215,7 +213,7 @@ def build(
         kwargs.setdefault("save_path", str(folder))
     if "kwargs" not in names and (foreign := next((k for k in kwargs if k not in names), None)):
         raise unknown(f"{place}: unknown argument", foreign, names[len(inner) :])
-    with as_user_error(place, TypeError, ValueError, AssertionError, Error):
+    with as_user_error(place, TypeError, ValueError, AssertionError, gym.error.Error):
         return cls(*inner, **build_value(kwargs, place, typed))
 
 

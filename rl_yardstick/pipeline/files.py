@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rl_yardstick.pipeline.errors import UserError, as_user_error
-from rl_yardstick.safe_files.files import UnsafeFileError, content_of
+from rl_yardstick.safe_files.files import UnsafeFileError, content_of, read_members
 
 MAX_TEXT = 10_000_000  # bytes of a settings file
 MAX_TABLE = 1 << 31  # bytes of a table, or of an archive of arrays
@@ -67,8 +67,6 @@ def read_arrays(
     ``shapes`` has the names of arrays and of their axes: those of one name have the same length.
     """
     from numpy.lib.format import read_array
-
-    from rl_yardstick.safe_files.files import read_members
 
     found: dict[str, Any] = {}
     lengths: dict[str, int] = {}

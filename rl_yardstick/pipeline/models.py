@@ -25,6 +25,7 @@ from rl_yardstick.pipeline.files import read_bytes
 from rl_yardstick.pipeline.run import RECORD, Run, numbered_runs, statistics_beside
 from rl_yardstick.pipeline.settings import check_agent, read_entry, read_saved, special_settings
 from rl_yardstick.pipeline.spec import TrainSpec, validated
+from rl_yardstick.safe_files.files import first_look
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -164,8 +165,6 @@ def replay_buffer_of(model: Path) -> Path | None:
 
 def zip_data(path: Path) -> dict[str, Any]:
     """The JSON in an agent's zip; pickles in it stay text."""
-    from rl_yardstick.safe_files.files import first_look
-
     content = read_bytes(path, MAX_MODEL)
     try:
         return first_look(content)

@@ -17,6 +17,7 @@ from rl_yardstick.envs.drawing import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, S
 from rl_yardstick.envs.drawing import ORANGE as AMBER
 from rl_yardstick.envs.layout import GOAL, PRIZE, START, TRAP, WALL, GridLayout
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
+from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 from rl_yardstick.pipeline.files import replacing
 from rl_yardstick.pipeline.run import read_episodes
@@ -46,7 +47,6 @@ def draw(folder: Path, parts: Any) -> None:
     spec, evaluation, agent = parts.spec, parts.evaluation, parts.agent
     if not spec.pictures:
         return
-    from rl_yardstick.pipeline.environments import training_changes
     from rl_yardstick.pipeline.evaluation.value_maps import value_map
 
     with parts.run.console.status("drawing the pictures"):

@@ -19,6 +19,7 @@ from typing import Any, Self
 from warnings import catch_warnings
 
 import numpy as np
+import yaml
 from filelock import FileLock, Timeout
 from pydantic import ValidationError
 from rich.console import Console
@@ -134,8 +135,6 @@ class Run:
 
     def begin(self, spec: TrainSpec, args: Mapping[str, Any], command: str) -> None:
         """Write what the run is about to do: settings for rl_zoo3, and ``run.json``."""
-        import yaml
-
         settings = self.path / spec.env_name
         settings.mkdir(exist_ok=True)
         # rl_zoo3's tools use env_kwargs in args.yml before those in config.yml.

@@ -23,6 +23,7 @@ import yaml
 
 from rl_yardstick.agents.own_classes import SMALLEST, fault_of
 from rl_yardstick.agents.registry import ALGORITHMS
+from rl_yardstick.envs.known_models import time_limit, transition_model
 from rl_yardstick.pipeline import components, environments
 from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknown
 from rl_yardstick.pipeline.files import read_text
@@ -411,8 +412,6 @@ _STEPS = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
 def _with_numbers(spec: TrainSpec, asked: list[str]) -> TrainSpec:
     """Settings of tables, from the evaluation environment."""
-    from rl_yardstick.envs.known_models import time_limit, transition_model
-
     environments.check_fit(spec)
     where, n_timesteps = f"{spec.algo} on {spec.env_id}", spec.n_timesteps
     origins, algorithm = dict(spec.origins), dict(spec.algorithm)
@@ -455,8 +454,6 @@ def _with_numbers(spec: TrainSpec, asked: list[str]) -> TrainSpec:
 
 def _with_rewards(spec: TrainSpec) -> TrainSpec:
     """The arguments of training wrappers, from the rewards that reach them."""
-    from rl_yardstick.envs.known_models import transition_model
-
     wrappers, told = list(spec.train_env_wrapper), []
     for place, wrapper in enumerate(wrappers):
         kwargs = dict(wrapper.kwargs)

@@ -22,6 +22,7 @@ from rl_yardstick.pipeline.environments import MISTAKES
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.files import replacing, write_json
 from rl_yardstick.pipeline.models import Which, load_agent, model_of_run
+from rl_yardstick.pipeline.playing import FrameTaker, play_episodes, playing_env
 from rl_yardstick.pipeline.run import RECORD, read_episodes
 
 FILM = "episode.gif"
@@ -92,8 +93,6 @@ def _loaded(planned: PlannedRun, which: Which = "final") -> Iterator[tuple[Any, 
     """An agent of a run, and an environment that draws pictures without a display."""
     import torch as th
 
-    from rl_yardstick.pipeline.playing import playing_env
-
     import_modules(planned.spec.gym_packages)
     th.set_num_threads(planned.spec.n_threads)
     model = model_of_run(planned.run, which)
@@ -108,8 +107,6 @@ def _filmed(
     agent: Any, env: Any, max_steps: int, *, deterministic: bool
 ) -> tuple[list[Any], tuple[float, int] | None]:
     """The frames of an episode, and its return and length, None if it did not end."""
-    from rl_yardstick.pipeline.playing import FrameTaker, play_episodes
-
     taker, frames = FrameTaker(env), list[Any]()
     kept: Any = {"after_step": lambda done: frames.extend(taker.take(done))}
     played = play_episodes(agent, env, 1, max_steps, deterministic=deterministic, **kept)
