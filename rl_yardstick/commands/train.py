@@ -126,6 +126,7 @@ def main() -> int:
 def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool) -> int:
     """Hold the folder, train, and print the result."""
     from rl_yardstick.commands.terminal import say
+    from rl_yardstick.pipeline.run import tracked
 
     with run:
         print_header(run.console, spec)
@@ -136,7 +137,6 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
             run.begin(spec, {**vars(args), "seed": spec.seed}, cli.command_line())
         try:
             with run.console.status("loading the libraries"):
-                from rl_yardstick.pipeline.tracking import tracked
                 from rl_yardstick.pipeline.training import train
             where = {"project": args.wandb_project_name, "entity": args.wandb_entity}
             where |= {"group": args.wandb_group, "tags": args.wandb_tags}

@@ -8,8 +8,8 @@ import re
 import shutil
 import signal
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
@@ -165,6 +165,28 @@ def save_agent(agent: Any, path: Path, buffer: Path | None = None) -> None:
     if buffer is not None and getattr(agent, "replay_buffer", None) is not None:
         with files.replacing(buffer) as beside:
             agent.save_replay_buffer(beside)
+
+
+@contextmanager
+def tracked(run: Run, spec: TrainSpec, where: Mapping[str, Any]) -> Iterator[None]:
+    """Send what TensorBoard is told to Weights & Biases, until the block ends.
+
+    ``where`` has entity, project, group and tags of ``wandb.init``. With ``WANDB_MODE=offline`` the
+    records stay in the run folder. Raises UserError if it refuses, e.g. without a key.
+    """
+    import wandb
+
+    with as_user_error("--track", wandb.Error):
+        tracking = wandb.init(
+            name=f"{spec.algo}/{run.path.name}",
+            dir=run.path,
+            config={"algo": spec.algo, "env": spec.env_id, "seed": spec.seed, **spec.hyperparams},
+            sync_tensorboard=True,  # its own integration
+            settings=wandb.Settings(console="off", silent=run.console.quiet),
+            **where,
+        )
+    with tracking:
+        yield
 
 
 def statistics_beside(model: Path) -> Path:
