@@ -18,7 +18,7 @@ from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.pipeline.components import arguments_of
 from rl_yardstick.pipeline.environments import check_env_id, map_name
 from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknown
-from rl_yardstick.pipeline.files import LONGEST_NAME, plain, portable_name
+from rl_yardstick.pipeline.files import plain, portable_name
 from rl_yardstick.pipeline.settings import (
     BUDGETS,
     ENV_KWARGS,
@@ -64,10 +64,10 @@ def symbol(setting: str) -> str:
     return _SYMBOLS.get(setting, setting)
 
 
-def file_name(label: str, longest: int = LONGEST_NAME) -> str:
-    """The label as a folder name of at most ``longest`` bytes."""
+def file_name(label: str) -> str:
+    """The label as the name of a folder."""
     label = re.sub(r"(\w) = ", lambda found: f"{_SPELT.get(found[1], found[1])}=", label)
-    return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_", longest)
+    return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_")
 
 
 def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -25,13 +25,13 @@ _REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
 _DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d) *(\.|$)", re.IGNORECASE)  # of Windows
 
 
-def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
-    """The name, or a similar one of at most ``longest`` bytes that is valid on every system."""
+def portable_name(name: str) -> str:
+    """The name, or a similar one of at most `LONGEST_NAME` bytes that is valid on every system."""
     plain = _DEVICE.sub(r"\1_", _REFUSED_SIGNS.sub("_", name)) or "_"
-    if plain == name and len(name.encode()) <= longest:
+    if plain == name and len(name.encode()) <= LONGEST_NAME:
         return name
     digest = hashlib.sha256(name.encode(errors="replace")).hexdigest()[:8]
-    kept = plain.encode(errors="replace")[: longest - len(digest) - 1]
+    kept = plain.encode(errors="replace")[: LONGEST_NAME - len(digest) - 1]
     return f"{kept.decode(errors='ignore')}-{digest}"
 
 
