@@ -33,6 +33,7 @@ from rl_yardstick.pipeline.errors import UserError, as_user_error, shown
 from rl_yardstick.pipeline.files import plain
 from rl_yardstick.tuning import suggesting
 from rl_yardstick.tuning.search_spaces import read_search_space
+from rl_yardstick.tuning.suggesting import planned_runs
 from rl_yardstick.tuning.tuning_spec import AUTO, STEPS, TuningSpec
 
 OWN_FILE = "trials.log"
@@ -263,7 +264,7 @@ class Search:
             new.trial.set_user_attr(SETTINGS, plain(entry))
             self._trials.append(new)
             try:
-                new.to_do = suggesting.planned_runs(self.tuning, self.root, entry)
+                new.to_do = planned_runs(self.tuning, self.root, entry)
                 return new
             except UserError as error:
                 self._fail(new, str(error))
