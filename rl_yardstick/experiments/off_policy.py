@@ -92,8 +92,7 @@ def cross_fit(
     Contexts are integers from 0, shape (n,), for means; or vectors, shape (n, d), for regressions.
     ``n_arms`` counts arms that were not pulled, too.
 
-    Raises:
-        ValueError: if there are fewer than two pulls.
+    Raises ValueError if there are fewer than two pulls.
     """
     if len(arms) < 2:
         raise ValueError("a model of the rewards needs two pulls or more")
@@ -317,8 +316,7 @@ def read_logged(path: Path, columns: Mapping[str, str] | None = None) -> LoggedD
 
     ``columns`` has the file's names of ``arm``, ``reward`` and ``propensity``, where they differ.
 
-    Raises:
-        UserError: if it cannot be read or lacks them.
+    Raises UserError if it cannot be read or lacks them.
     """
     try:
         data = read_log(path, columns or {})
@@ -336,8 +334,7 @@ def read_logged(path: Path, columns: Mapping[str, str] | None = None) -> LoggedD
 def load_policy(path: Path, typed: Sequence[str] = ()) -> LoggedPolicy:
     """Load the agent of a run folder or a zip; ``typed`` are modules that the user typed.
 
-    Raises:
-        UserError: if there is none, or it does not observe the log's contexts.
+    Raises UserError if there is none, or it does not observe the log's contexts.
     """
     wanted = Wanted(path, env_id="ReplayBandit-v0", typed=list(typed), device="cpu")
     model = find_model(wanted)
@@ -355,8 +352,7 @@ def load_policy(path: Path, typed: Sequence[str] = ()) -> LoggedPolicy:
 def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comparison:
     """Evaluate policies, each arm as a constant policy, and the log's own policy.
 
-    Raises:
-        UserError: if a policy does not fit the log, or the log cannot support an estimate.
+    Raises UserError if a policy does not fit the log, or the log cannot support an estimate.
     """
     spaces_of_actions: list[Any] = [policy.agent.action_space for policy in policies]
     space = data.observation_space
@@ -387,9 +383,7 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
 def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
     """The probability of each arm at each logged pull, shape (n, arms of the agent).
 
-    Raises:
-        UserError: if the agent does not observe the log's contexts, or needs further
-            observations.
+    Raises UserError if the agent does not observe the log's contexts, or needs more than these.
     """
     from rl_yardstick.agents.policies import policy_matrix, why_not_exact
 
@@ -411,11 +405,7 @@ def _judge(data: LoggedData, name: str, policy: Floats, predicted: Floats) -> Po
 
 
 def _notes(data: LoggedData, policy: LoggedPolicy) -> list[str]:
-    """Notes on an agent that was trained on a log.
-
-    Raises:
-        UserError: if that log numbered text contexts differently.
-    """
+    """Notes on an agent of a log; UserError if that log numbered text contexts differently."""
     if policy.log is None or not policy.log.is_file():
         return []
     if policy.log.resolve() == Path(data.source).resolve():

@@ -98,8 +98,7 @@ def results_of(
 ) -> results.StudyResults:
     """The logs as the results of a study in the folder ``root``; adds to the notes.
 
-    Raises:
-        UserError: if labels are missing, or are those of two runs.
+    Raises UserError if labels are missing, or are those of two runs.
     """
     counts, half = Counter(kind for log in every for kind in log.figures), len(every) // 2
     # The first that more than half of the runs have, or else most.

@@ -142,8 +142,7 @@ def plan(
 def specs_of(study: StudySpec) -> dict[Labels, TrainSpec]:
     """What each agent trains on each environment, but for the seed.
 
-    Raises:
-        UserError: if an agent's settings are invalid, or it does not fit an environment.
+    Raises UserError if an agent's settings are invalid, or it does not fit an environment.
     """
     _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
     _check_folders("environments", [(one.label, one.folder) for one in study.environments])
@@ -269,11 +268,7 @@ class StudyRecord:
 
     @classmethod
     def read(cls, root: Path) -> StudyRecord:
-        """Read ``study.json`` as data.
-
-        Raises:
-            UserError: if there is none, or it is not of this version.
-        """
+        """Read ``study.json`` as data; UserError if there is none, or not one of this version."""
         if not (root / RECORD).exists():
             raise UserError(f"{root} is no study: it has no {RECORD}")
         data = read_json(root / RECORD, MAX_RECORD)
@@ -301,8 +296,7 @@ def plan_of_looks(study: StudySpec, root: Path, most: int | None) -> tuple[int, 
 
     ``most`` is the largest number of seeds of an agent; None: as planned before, or ``MOST_SEEDS``.
 
-    Raises:
-        UserError: if this differs from an earlier plan, or there is nothing to decide.
+    Raises UserError if this differs from an earlier plan, or there is nothing to decide.
     """
     if len(study.agents) < 2:
         raise UserError(f"{study.name}: --until-decided takes two agents or more")

@@ -190,8 +190,7 @@ def read_results(
 def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
     """Read the results of a run, or None if it is missing or not finished.
 
-    Raises:
-        UserError: if a file that a comparison reads is missing or invalid.
+    Raises UserError if a file that a comparison reads is missing or invalid.
     """
     recorded = planned.recorded()
     if not planned.is_finished_by(recorded):

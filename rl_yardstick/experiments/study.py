@@ -319,8 +319,7 @@ _SAME = (
 def find_study(given: str) -> Path:
     """The given path, or that of a shipped study such as ``mine-maze``, ``studies/mine-maze.yml``.
 
-    Raises:
-        UserError: if it is a plain name, and neither exists.
+    Raises UserError if it is a plain name, and neither exists.
     """
     path = Path(given)
     if path.is_file() or path.parent not in (Path(), Path("studies")):
@@ -335,8 +334,7 @@ def find_study(given: str) -> Path:
 def read_study(path: Path) -> StudySpec:
     """Read a study file; its name is the study's name.
 
-    Raises:
-        UserError: if it cannot be read, or contains unknown or invalid settings.
+    Raises UserError if it cannot be read, or contains unknown or invalid settings.
     """
     data = read_yaml(path)
     if not (isinstance(data, dict) and all(isinstance(key, str) for key in data)):
@@ -420,8 +418,7 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
 
     Changes are typed as ``key:value``, or several of these separated by spaces.
 
-    Raises:
-        UserError: if a change cannot be parsed.
+    Raises UserError if a change cannot be parsed.
     """
     own, shipped = spec.hyperparams, shipped_hyperparams(spec)
     typed = {change: parse_assignments(change.split(), "--test") for change in changes}

@@ -62,11 +62,7 @@ class RunOutcome:
 
 
 def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
-    """Read the figure of a finished run, and its time.
-
-    Raises:
-        UserError: if the run has not finished, or has no such figure.
-    """
+    """Read a run's figure and its time; UserError if it has not finished, or has no such figure."""
     results = read_run(tuning.study, planned)
     if results is None:
         raise UserError("it has not finished")
@@ -330,8 +326,7 @@ class Search:
 def open_search(tuning: TuningSpec, root: Path) -> Search:
     """Check a search, and open or create its trials in its folder, which this process has locked.
 
-    Raises:
-        UserError: if the search cannot be done, or the folder has another one.
+    Raises UserError if the search cannot be done, or the folder has another one.
     """
     run, agent = plan(replace(tuning.study, n_seeds=1), root)[0], tuning.agent
     if tuning.figure == AUTO:
@@ -370,8 +365,7 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
 def open_storage(root: Path) -> BaseStorage:
     """Open the journal of the trials in the search's folder, which this process has locked.
 
-    Raises:
-        UserError: if the file is damaged, or holds a study of another program.
+    Raises UserError if the file is damaged, or holds a study of another program.
     """
     path = root / OWN_FILE
     if path.exists():
