@@ -13,9 +13,8 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
-import rl_yardstick.envs  # noqa: F401  # registers this project's environments
 from rl_yardstick.agents.registry import ALGORITHMS, fitting_algorithms, is_bandit
-from rl_yardstick.envs import wrappers
+from rl_yardstick.envs import wrappers  # and registers this project's environments
 from rl_yardstick.envs.bandits.logged import ReplayBandit
 from rl_yardstick.envs.grid import GridWorld, read_rows
 from rl_yardstick.pipeline.components import build, import_modules, split_id
