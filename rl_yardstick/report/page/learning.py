@@ -190,20 +190,15 @@ BATCH = "its runs were done as one batch, which saves no agent"
 def write_first_pages(analysis: StudyAnalysis, n_workers: int, stop: Stop) -> list[LearningPage]:
     """Write a page for the first run of each agent, into ``learning``; newer pages stay.
 
-    Args:
-        analysis: the study.
-        n_workers: how many trainings are repeated at once, each in a process of its own.
-        stop: ends them after a signal.
-
-    Returns:
-        For each agent on each environment its page, or the reason why there is none.
+    Repeats up to ``n_workers`` trainings at once, each in a process of its own, and ends them after
+    a signal. Returns for each agent on each environment its page, or why there is none.
     """
     root, timeout = analysis.results.root, analysis.study.run_timeout
-    pages = {run.labels: _page_of(root, run) for runs in first_runs(analysis) for run in runs}
-    runs = [run for group in first_runs(analysis) for run in group if pages[run.labels] is None]
-    pool = process_pool(n_workers)
+    runs = [run for of_place in first_runs(analysis) for run in of_place]
+    pages = {run.labels: _page_of(root, run) for run in runs}
+    to_do, pool = [run for run in runs if pages[run.labels] is None], process_pool(n_workers)
     try:
-        again = {pool.submit(_train_again, timeout, root, run): run for run in runs}
+        again = {pool.submit(_train_again, timeout, root, run): run for run in to_do}
         while wait(again, timeout=0.2).not_done:
             stop.check()
     finally:
