@@ -95,17 +95,17 @@ def several(names: str, words: str, metavar: Any = "KEY:VALUE", **options: Any) 
 class OneLineParser(argparse.ArgumentParser):
     """A parser of groups of flags, by their titles, whose errors are one line."""
 
-    def __init__(
-        self, description: str, epilog: str, flags: Flags | None = None, **kwargs: Any
-    ) -> None:
-        kwargs.setdefault("prog", os.path.basename(sys.argv[0]))  # noqa: PTH119  # a name
+    def __init__(self, description: str, epilog: str, flags: Flags | None = None) -> None:
         for command in COMMANDS:
             for typed in (f"python {command}.py", f"python -m rl_yardstick {command}"):
                 epilog = epilog.replace(typed, called_as(command))
-        description = textwrap.fill(description, 79)
-        # No abbreviations: --seed would be taken for --seeds, which means something else.
-        kwargs |= {"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter}
-        super().__init__(description=description, epilog=epilog, **kwargs)
+        super().__init__(
+            prog=os.path.basename(sys.argv[0]),  # noqa: PTH119  # a name
+            description=textwrap.fill(description, 79),
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,  # --seed would be taken for --seeds, which means something else
+        )
         for title, members in (flags or {}).items():
             group = self.add_argument_group(title) if title else self
             for names, options in members:
@@ -202,11 +202,6 @@ def folder_name(text: str) -> str:
     return text
 
 
-def model_limit(text: str) -> str:
-    """``auto``, ``none``, or the most states of a model."""
-    return text if text in {"auto", "none"} else str(whole_number(1)(text))
-
-
 COUNT = whole_number(1)
 BUDGET = whole_number(1, besides={-1: "as in the hyperparameters"})  # as in rl_zoo3
 INTERVAL = whole_number(-LARGEST)  # below 1 for never, as in rl_zoo3
@@ -255,7 +250,7 @@ _SHARED: Sequence[Flag] = (
         "--model",
         "where none is published, find the environment's exact model in its code: auto (at most "
         "10 s and 100,000 states), none, or the most states",
-        model_limit,
+        lambda text: text if text in {"auto", "none"} else str(COUNT(text)),
         "auto",
         dest="exact_model",
     ),
@@ -328,16 +323,10 @@ def check_alone(
 # --- checks of values -----------------------------------------------------------------------------
 
 
-def check_tensorboard(wanted: object) -> None:
-    """Raise `UserError` if a TensorBoard log is wanted and TensorBoard is not installed."""
-    if wanted and importlib.util.find_spec("tensorboard") is None:
-        raise UserError("-tb needs: pip install 'rl-yardstick[tensorboard]'")
-
-
-def check_wandb(wanted: bool) -> None:
-    """Raise `UserError` if a run is to be tracked and wandb or TensorBoard is not installed."""
-    if wanted and not all(map(importlib.util.find_spec, ("wandb", "tensorboard"))):
-        raise UserError("--track needs: pip install 'rl-yardstick[wandb]'")
+def check_installed(wanted: object, what: str, extra: str, *modules: str) -> None:
+    """Raise `UserError` if something is wanted whose modules are not installed."""
+    if wanted and not all(map(importlib.util.find_spec, modules)):
+        raise UserError(f"{what} needs: pip install 'rl-yardstick[{extra}]'")
 
 
 def check_device(device: str) -> None:

@@ -423,7 +423,7 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
         raise UserError("--until-decided and --quick do not go together: give one of them")
     if args.learning_pages and args.no_report:
         raise UserError("--watch-learning is a section of the page: leave out --no-report")
-    cli.check_tensorboard(args.tensorboard)
+    cli.check_installed(args.tensorboard, "-tb", "tensorboard", "tensorboard")
     if args.study and (args.env or args.algos):
         raise UserError("give a study file, or --env and --algos, not both")
     if not args.study and not (args.env and args.algos):

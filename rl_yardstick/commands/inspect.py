@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rl_yardstick.commands.cli import OneLineParser
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import UserError, as_user_error
 
 
 def main() -> int:
@@ -19,12 +19,10 @@ def main() -> int:
     from rl_yardstick.commands.terminal import say, table_console
     from rl_yardstick.safe_files.models import inspect_model
 
-    try:
+    if not path.exists():
+        raise UserError(f"no such model file: {path}")
+    with as_user_error(f"{path} is no model", OSError, ValueError):
         found = inspect_model(path)
-    except FileNotFoundError:
-        raise UserError(f"no such model file: {path}") from None
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} is no model: {one_line(error)}") from error
     suspicious = found.pop("suspicious")
     found["suspicious" if suspicious else "nothing in it is suspicious"] = suspicious
     console = table_console()

@@ -128,7 +128,6 @@ def _below(path: Path) -> Iterator[Path]:
 
 
 def _row(name: str, rated: Rating | str) -> dict[str, Any]:
-    """The row of the tables."""
     if isinstance(rated, str):
         return {"file": name, "note": rated}
     figures = rated.mean_return, rated.optimum, rated.score, rated.success_rate

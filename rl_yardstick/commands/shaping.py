@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
 from rl_yardstick.commands.train import entry_from_flags
-from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.errors import UserError, as_user_error
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -78,7 +78,6 @@ def main() -> int:
 
 
 def _spec(args: argparse.Namespace) -> TrainSpec:
-    """The settings of the agent, with the changes in training."""
     from rl_yardstick.pipeline.environments import check_env_id, with_files_read
     from rl_yardstick.pipeline.settings import check_agent, parse_assignments, read_spec
 
@@ -204,12 +203,10 @@ def _compared(spec: TrainSpec, env: gym.Env[Any, Any], discount: float) -> Compa
     original, horizon = known_model(env, spec.env_id), time_limit(env)
     assert horizon is not None  # evaluations always have one
     effects = {}
-    try:
+    with as_user_error(spec.env_id, ValueError):
         if discount < 1:
             effects[discount] = discounted_effect(original, shaped, discount, horizon)
         effects[1.0] = effect_under_limit(original, shaped, horizon)
-    except ValueError as error:
-        raise UserError(f"{spec.env_id}: {error}") from error
     return Compared(env, original, horizon, effects)
 
 

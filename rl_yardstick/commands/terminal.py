@@ -37,7 +37,6 @@ class TextConsole(Console):
         if not self.is_terminal and all(isinstance(item, str) for item in objects):
             options["soft_wrap"] = True
             objects = tuple(map(wrapped, objects))
-        options["markup"] = False
         super().print(*objects, **options)
 
     def on_broken_pipe(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -125,17 +125,22 @@ def main() -> int:
 
 def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool) -> int:
     """Hold the folder, train, and print the result."""
+    from rl_yardstick.commands.terminal import say
+    from rl_yardstick.pipeline.run import tracked
+
     with run:
         print_header(run.console, spec)
         if args.storage and not resumes:
             trial = f"trial {args.trial_id} of {args.study_name} in {args.storage}"
-            run.console.print(trial, style="dim", markup=False, highlight=False, soft_wrap=True)
+            say(run.console, trial, "dim")
         if not resumes:
             run.begin(spec, {**vars(args), "seed": spec.seed}, cli.command_line())
         try:
             with run.console.status("loading the libraries"):
                 from rl_yardstick.pipeline.training import train
-            with tracking(spec, run, args):
+            where = {"project": args.wandb_project_name, "entity": args.wandb_entity}
+            where |= {"group": args.wandb_group, "tags": args.wandb_tags}
+            with tracked(run, spec, where) if args.track else nullcontext():
                 outcome = train(spec, run, resumes, print_engine)
         except Stopped:
             if run.has_begun:
@@ -145,16 +150,6 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
         if not run.console.quiet:
             print_outcome(run, spec, outcome, args)
     return 0
-
-
-def tracking(spec: TrainSpec, run: Run, args: argparse.Namespace) -> AbstractContextManager[None]:
-    """The run in Weights & Biases, if ``--track`` asks for it."""
-    if not args.track:
-        return nullcontext()
-    from rl_yardstick.pipeline.tracking import tracked
-
-    where = {"project": args.wandb_project_name, "entity": args.wandb_entity}
-    return tracked(run, spec, **where, group=args.wandb_group, tags=args.wandb_tags)
 
 
 # --- from flags to a spec -------------------------------------------------------------------------
@@ -168,20 +163,15 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
 
     settings.check_agent(args.algo)
     environments.check_env_id(args.env)
-    cli.check_tensorboard(args.tensorboard_log)
-    cli.check_wandb(args.track)
+    cli.check_installed(args.tensorboard_log, "-tb", "tensorboard", "tensorboard")
+    cli.check_installed(args.track, "--track", "wandb", "wandb", "tensorboard")
     cli.check_device(args.device)
     entry, origins = entry_from_flags(args)
-    names = ["eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer"]
-    names += [
-        "exact_model",
-        "log_interval",
-        "vec_env",
-        "device",
-        "diagnose",
-        "watch_episodes",
+    names = (
+        *("eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer"),
+        *("exact_model", "log_interval", "vec_env", "device", "diagnose", "watch_episodes"),
         "gym_packages",
-    ]
+    )
     spec = settings.read_spec(
         args.algo,
         args.env,
@@ -254,7 +244,6 @@ def whole_zip(path: Path) -> str:
 
 
 def _statistics(args: argparse.Namespace) -> str | None:
-    """The absolute path of ``--vec-normalize``, or ``none``."""
     path = args.vec_normalize
     if path is not None and not args.trained_agent:
         raise UserError("--vec-normalize needs --trained-agent")
@@ -289,7 +278,7 @@ def resume(run: Run, args: argparse.Namespace) -> int:
     spec = resumable(run.path)
     check_typed(spec.gym_packages, args.gym_packages, str(run.path))
     check_code(spec, str(run.path))
-    cli.check_wandb(args.track)
+    cli.check_installed(args.track, "--track", "wandb", "wandb", "tensorboard")
     log = spec.tensorboard_log or (TRACKED if args.track else None)
     spec = spec.changed(gym_packages=args.gym_packages, tensorboard_log=log)
     return carry_out(spec, run, args, resumes=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import math
 import time
 from collections import Counter
@@ -17,7 +16,7 @@ from rl_yardstick.commands import cli, compare
 from rl_yardstick.commands.cli import Flags, OneLineParser, flag, seconds, shared, switch
 from rl_yardstick.commands.compare import Job, held
 from rl_yardstick.commands.terminal import say, table_console
-from rl_yardstick.pipeline.errors import Stopped, UserError
+from rl_yardstick.pipeline.errors import Stopped
 from rl_yardstick.tuning.tuning_spec import (
     AUTO,
     FIGURES,
@@ -102,8 +101,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     """The search that the arguments ask for."""
     from rl_yardstick.experiments.study import AgentSpec, with_maps_named
 
-    if importlib.util.find_spec("optuna") is None:
-        raise UserError("tuning needs: pip install 'rl-yardstick[tune]'")
+    cli.check_installed(True, "tuning", "tune", "optuna")
     study = compare.study_of([args.algo], [args.env])
     # The settings that the command line fixes.
     settings = cli.with_engine(args.algo, compare.typed_settings(args), args.engine)
@@ -192,20 +190,18 @@ def do_retest(job: Job, search: Search) -> int:
     """Run the best settings again, and write the winner; return the exit code."""
     from rl_yardstick.tuning.retesting import best_trials, chosen_for_retest, write_winner
 
-    ranked = best_trials(search.tuning, search.trials)
-    chosen = chosen_for_retest(search.tuning, ranked)
-    if chosen:
+    ranked, outcome, winner = best_trials(search.tuning, search.trials), None, None
+    code = 0 if ranked or not search.is_done else 1
+    if chosen := chosen_for_retest(search.tuning, ranked):
         code, outcome = retested(job, search, ranked, chosen)
         print_outcome(job.console, outcome)
-        path = write_winner(search, outcome)
-        write_down(job, search, outcome, to_train(search.tuning, path))
-        if path is not None and outcome.winner is not None:
-            print_winner(job.console, search, outcome.winner.number, path)
-        return code
-    if search.tuning.retest:
+        winner = write_winner(search, outcome)
+    elif search.tuning.retest:
         say(job.console, "no re-test: no other setting came close to the shipped one")
-    write_down(job, search, None, to_train(search.tuning, None))
-    return 0 if ranked or not search.is_done else 1
+    write_down(job, search, outcome, winner)
+    if outcome is not None and outcome.winner is not None and winner is not None:
+        print_winner(job.console, search, outcome.winner.number, winner)
+    return code
 
 
 def retested(
@@ -227,7 +223,7 @@ def retested(
             return code, concluded(tuning, ranked, chosen, analyse(results, looks))
 
 
-def write_down(job: Job, search: Search, outcome: Outcome | None, command: str) -> None:
+def write_down(job: Job, search: Search, outcome: Outcome | None, winner: Path | None) -> None:
     """Write the record of the search, and its page."""
     from rl_yardstick.tuning.retesting import FOLDER, RECORD, write_record
 
@@ -239,7 +235,7 @@ def write_down(job: Job, search: Search, outcome: Outcome | None, command: str) 
 
             page, retest = job.root / "report.html", f"{FOLDER}/report.html"
             retest = retest if (job.root / retest).exists() else ""
-            write_tuning_page(record, page, retest, command)
+            write_tuning_page(record, page, retest, to_train(search.tuning, winner))
             files.append(page)
     say(job.console, f"files: {', '.join(map(str, files))}")
 

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from rl_yardstick import verdicts
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs.brackets import return_bounds
 from rl_yardstick.experiments.results import StudyResults, values_over_seeds
@@ -20,22 +21,7 @@ from rl_yardstick.experiments.study import COSTS, OF_TRAINING, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
 from rl_yardstick.pipeline.evaluation.yardstick import FAILED, Yardstick
-from rl_yardstick.verdicts import (
-    UNBOUNDED,
-    AgentRuns,
-    Best,
-    Bounds,
-    Estimate,
-    Pair,
-    Study,
-    Summary,
-    ThresholdSummary,
-    judge,
-    mean_over_runs,
-    performance_profile,
-    summarise,
-    summarise_steps,
-)
+from rl_yardstick.verdicts import Best, Bounds, Estimate, Pair, Study, Summary, ThresholdSummary
 
 ON_THE_SCALE = ("final", "best")  # metrics on the scale of the best random or constant policy
 FIXED_POLICIES = ("planning", "reference")  # families of agents that do not learn
@@ -124,9 +110,9 @@ def _bounds(results: StudyResults, environment: str, optimum: float | None) -> B
         return 0.0, np.inf
     first = {run.agent: run for run in results.planned if run.environment == environment}
     if not next(iter(first.values())).spec.env_id:
-        return UNBOUNDED  # an environment of somebody else's runs that is not known here
+        return verdicts.UNBOUNDED  # an environment of somebody else's runs that is not known here
     if study.metric in OF_TRAINING and any(training_changes(r.spec) for r in first.values()):
-        return UNBOUNDED  # returns of training on a changed environment
+        return verdicts.UNBOUNDED  # returns of training on a changed environment
     with closing(make_single_env(next(iter(first.values())).spec)) as env:
         low, high = return_bounds(env)
     return low, high if optimum is None or study.metric in OF_TRAINING else min(high, optimum)
@@ -154,7 +140,7 @@ def _verdicts_on(
     if overall is not None:
         scores[OVERALL], bounds[OVERALL] = overall, UNIT
         margin[OVERALL], baseline[OVERALL] = MARGIN, None
-    return judge(
+    return verdicts.judge(
         scores,
         bounds=bounds,
         margin=margin,
@@ -202,15 +188,16 @@ def scores_over_all(results: StudyResults) -> dict[str, Floats] | None:
 
 def _overall(scores: Mapping[str, Floats], said: Study) -> OverallAnalysis:
     means = {agent: matrix.mean(axis=1) for agent, matrix in scores.items()}
-    summaries = {agent: summarise(values, UNIT) for agent, values in means.items()}
+    summaries = {agent: verdicts.summarise(values, UNIT) for agent, values in means.items()}
     order = sorted(means, key=lambda agent: summaries[agent].mean.point, reverse=True)
     thresholds = np.linspace(0, 1, 101)
+    profiles = {name: verdicts.performance_profile(scores[name], thresholds) for name in order}
     return OverallAnalysis(
         scores={agent: summaries[agent] for agent in order},
         pairs=_in_order([pair for pair in said.pairs if pair.environment == OVERALL], order),
         best=said.best.get(OVERALL),
         thresholds=thresholds,
-        profiles={agent: performance_profile(scores[agent], thresholds) for agent in order},
+        profiles=profiles,
     )
 
 
@@ -232,7 +219,7 @@ class AgentAnalysis:
     """The results of one agent on one environment."""
 
     agent: str  #: its label
-    runs: AgentRuns  #: its runs as the verdicts compare them
+    runs: verdicts.AgentRuns  #: its runs as the verdicts compare them
     spread: float  #: the standard deviation of these over runs
     n_runs: int  #: finished runs
     n_missing: int  #: unfinished runs
@@ -361,7 +348,9 @@ def _differing_optima(table: pd.DataFrame) -> dict[str, float]:
     return {} if alike else optima
 
 
-def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -> AgentAnalysis:
+def _analyse_agent(
+    results: StudyResults, evidence: Evidence, runs: verdicts.AgentRuns
+) -> AgentAnalysis:
     study, table, environment = results.study, results.summary, evidence.environment
     agent = runs.name
     table = table[(table["environment"] == environment) & (table["agent"] == agent)]
@@ -371,21 +360,21 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         column_of = table.set_index("seed")[column].reindex(study.seeds[:n_seeds])
         return column_of.to_numpy(dtype=np.float64, na_value=np.nan)
 
-    def mean(column: str, bounds: Bounds = UNBOUNDED) -> Estimate:
-        return mean_over_runs(values(column), bounds)
+    def mean(column: str, bounds: Bounds = verdicts.UNBOUNDED) -> Estimate:
+        return verdicts.mean_over_runs(values(column), bounds)
 
     def steps(column: str) -> ThresholdSummary | None:
-        found = summarise_steps(values(column))
+        found = verdicts.summarise_steps(values(column))
         return found if found.median.n else None
 
-    def known(column: str, bounds: Bounds = UNBOUNDED) -> Estimate | None:
+    def known(column: str, bounds: Bounds = verdicts.UNBOUNDED) -> Estimate | None:
         return mean(column, bounds) if table[column].notna().any() else None
 
     finite = evidence.scores[agent][np.isfinite(evidence.scores[agent])]
     optimum, baseline, score = evidence.optimum, evidence.baseline, None
     if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
-        score = mean_over_runs(np.clip(values("score"), 0, 1), UNIT)
-    of_returns = evidence.bounds if study.metric in ON_THE_SCALE else UNBOUNDED
+        score = verdicts.mean_over_runs(np.clip(values("score"), 0, 1), UNIT)
+    of_returns = evidence.bounds if study.metric in ON_THE_SCALE else verdicts.UNBOUNDED
     specs = {run.labels: run.spec for run in results.planned if run.spec.env_id}
     spec = specs.get((agent, environment))
     return AgentAnalysis(
@@ -394,7 +383,7 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         spread=float(finite.std(ddof=1)) if len(finite) > 1 else 0.0,
         n_runs=len(table),
         n_missing=n_seeds - len(table),
-        metric=summarise(values(study.metric), evidence.bounds),
+        metric=verdicts.summarise(values(study.metric), evidence.bounds),
         score=score,
         final=mean("final", of_returns),
         last_episodes=mean("last_episodes"),

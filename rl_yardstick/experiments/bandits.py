@@ -64,11 +64,7 @@ class PullStatistics:
 
     @classmethod
     def load(cls, path: Path) -> PullStatistics:
-        """Read the file that `save` wrote.
-
-        Raises:
-            UserError: if the file is missing, or has another schema.
-        """
+        """Read the file that `save` wrote; UserError if it is missing, or has another schema."""
         kinds = get_type_hints(cls, include_extras=True)
         return cls(**read_arrays(path, {n: kind.__metadata__[0] for n, kind in kinds.items()}))
 

@@ -22,7 +22,7 @@ from distributed import Client, LocalCluster
 
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.pool import Workers, do_run
-from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown
+from rl_yardstick.pipeline.errors import Stopped, UserError, as_user_error, shown
 from rl_yardstick.pipeline.run import Stop, versions
 from rl_yardstick.pipeline.settings import read_yaml
 
@@ -71,13 +71,11 @@ class ClusterWorkers(Workers):
     def _client(self) -> Any:
         """The connection, after a check of versions and of the shared folder."""
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        try:
+        with as_user_error(f"--cluster {self.where}", OSError, ValueError, TypeError, RuntimeError):
             client = self._connected()
             client.wait_for_workers(1, timeout=600)
             client.get_versions(check=True)
             found = client.run(_facts, str(self.root))
-        except (OSError, ValueError, TypeError, RuntimeError) as error:
-            raise UserError(f"--cluster {self.where}: {one_line(error)}") from error
         for worker, (theirs, shares_folder) in found.items():
             for name, version in versions().items():
                 if theirs.get(name) != version:

@@ -19,11 +19,11 @@ import numpy as np
 import pandas as pd
 
 from rl_yardstick.experiments.results import LAST_EPISODES as LAST
-from rl_yardstick.experiments.results import MAX_TABLE, Episodes, joined_episodes, read_evaluations
+from rl_yardstick.experiments.results import read_evaluations
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
-from rl_yardstick.pipeline.files import read_bytes
-from rl_yardstick.pipeline.run import RECORD, Run
+from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line, shown, unknown
+from rl_yardstick.pipeline.files import MAX_TABLE, read_bytes
+from rl_yardstick.pipeline.run import RECORD, Episodes, Run, joined_episodes
 from rl_yardstick.pipeline.settings import read_saved
 
 # The kinds of final figures, the best first; those of tables are named as their columns.
@@ -189,12 +189,10 @@ def _add_events(log: Log) -> None:
         raise UserError(f"{log.path}: event files need: pip install 'rl-yardstick[tensorboard]'")
     module = "tensorboard.backend.event_processing.event_accumulator"
     events = importlib.import_module(module).EventAccumulator(str(log.path), {"scalars": 0})
-    try:
+    with as_user_error(f"{log.path}: damaged event files", Exception):  # of TensorBoard
         events.Reload()
         for tag in returns_in(events.Tags()["scalars"]):
             log.add(tag, *np.transpose([(one.step, one.value) for one in events.Scalars(tag)]))
-    except Exception as error:  # TensorBoard's, of a damaged file
-        raise UserError(f"{log.path}: damaged event files: {one_line(error)}") from error
 
 
 # --- tables ---------------------------------------------------------------------------------------
@@ -222,10 +220,8 @@ def _read_table(path: Path) -> pd.DataFrame:
     """A text table with a row of headings; commas, semicolons or tabs separate its cells."""
     content = read_bytes(path, MAX_TABLE).decode(errors="replace")
     separator = max(",;\t", key=content.partition("\n")[0].count)
-    try:
+    with as_user_error(f"{path} is no table", ValueError, RecursionError):
         return pd.read_csv(io.StringIO(content), sep=separator)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is no table: {one_line(error)}") from error
 
 
 def table_logs(

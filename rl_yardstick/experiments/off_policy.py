@@ -26,11 +26,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from scipy import special
+from scipy import linalg, special
 
 from rl_yardstick.envs.bandits import LoggedData, read_log
 from rl_yardstick.mdp.transition_model import Floats, Ints
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line
+from rl_yardstick.pipeline.models import Wanted, find_model, load_agent
 from rl_yardstick.verdicts import Estimate
 
 if TYPE_CHECKING:
@@ -68,8 +69,6 @@ def arm_regressions(
 
     Source: Hoerl and Kennard (1970), "Ridge regression", Technometrics 12.
     """
-    from scipy import linalg
-
     centre, scale = contexts.mean(axis=0), contexts.std(axis=0)
     scale[scale == 0] = 1
     known, inputs = (
@@ -93,8 +92,7 @@ def cross_fit(
     Contexts are integers from 0, shape (n,), for means; or vectors, shape (n, d), for regressions.
     ``n_arms`` counts arms that were not pulled, too.
 
-    Raises:
-        ValueError: if there are fewer than two pulls.
+    Raises ValueError if there are fewer than two pulls.
     """
     if len(arms) < 2:
         raise ValueError("a model of the rewards needs two pulls or more")
@@ -318,8 +316,7 @@ def read_logged(path: Path, columns: Mapping[str, str] | None = None) -> LoggedD
 
     ``columns`` has the file's names of ``arm``, ``reward`` and ``propensity``, where they differ.
 
-    Raises:
-        UserError: if it cannot be read or lacks them.
+    Raises UserError if it cannot be read or lacks them.
     """
     try:
         data = read_log(path, columns or {})
@@ -337,11 +334,8 @@ def read_logged(path: Path, columns: Mapping[str, str] | None = None) -> LoggedD
 def load_policy(path: Path, typed: Sequence[str] = ()) -> LoggedPolicy:
     """Load the agent of a run folder or a zip; ``typed`` are modules that the user typed.
 
-    Raises:
-        UserError: if there is none, or it does not observe the log's contexts.
+    Raises UserError if there is none, or it does not observe the log's contexts.
     """
-    from rl_yardstick.pipeline.models import Wanted, find_model, load_agent
-
     wanted = Wanted(path, env_id="ReplayBandit-v0", typed=list(typed), device="cpu")
     model = find_model(wanted)
     # Settings that change an agent's observations, so that they differ from the log's contexts.
@@ -358,17 +352,15 @@ def load_policy(path: Path, typed: Sequence[str] = ()) -> LoggedPolicy:
 def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comparison:
     """Evaluate policies, each arm as a constant policy, and the log's own policy.
 
-    Raises:
-        UserError: if a policy does not fit the log, or the log cannot support an estimate.
+    Raises UserError if a policy does not fit the log, or the log cannot support an estimate.
     """
     spaces_of_actions: list[Any] = [policy.agent.action_space for policy in policies]
     space = data.observation_space
     contexts = data.contexts if not isinstance(space, spaces.Discrete) else data.observations(space)
     n_arms = max([data.n_arms, *(int(space.n) for space in spaces_of_actions)])
-    try:  # means for Discrete contexts, else regressions
+    with as_user_error(str(data.source), ValueError):
+        # Means for Discrete contexts, else regressions.
         predicted = cross_fit(contexts, data.arms, data.rewards, n_arms)
-    except ValueError as error:
-        raise UserError(f"{data.source}: {one_line(error)}") from error
     notes = [note for policy in policies for note in _notes(data, policy)]
     rows = [
         Judged(policy.name, _judge(data, policy.name, probabilities(policy, data), predicted), True)
@@ -391,17 +383,13 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
 def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
     """The probability of each arm at each logged pull, shape (n, arms of the agent).
 
-    Raises:
-        UserError: if the agent does not observe the log's contexts, or needs further
-            observations.
+    Raises UserError if the agent does not observe the log's contexts, or needs more than these.
     """
     from rl_yardstick.agents.policies import policy_matrix, why_not_exact
 
     agent: Any = policy.agent
-    try:
+    with as_user_error(policy.name, ValueError):
         observations = data.observations(agent.observation_space)
-    except ValueError as error:
-        raise UserError(f"{policy.name}: {one_line(error)}") from error
     if reason := why_not_exact(agent, observations):
         raise UserError(f"{policy.name} cannot be judged on a log: {reason}")
     return policy_matrix(agent, observations)
@@ -412,18 +400,12 @@ def _judge(data: LoggedData, name: str, policy: Floats, predicted: Floats) -> Po
     padded = np.zeros(predicted.shape)
     padded[:, : policy.shape[1]] = policy
     assert data.propensities is not None
-    try:
+    with as_user_error(f"{name} on {data.source}", ValueError):
         return evaluate_policy(padded, data.arms, data.rewards, data.propensities, predicted)
-    except ValueError as error:
-        raise UserError(f"{name} on {data.source}: {one_line(error)}") from error
 
 
 def _notes(data: LoggedData, policy: LoggedPolicy) -> list[str]:
-    """Notes on an agent that was trained on a log.
-
-    Raises:
-        UserError: if that log numbered text contexts differently.
-    """
+    """Notes on an agent of a log; UserError if that log numbered text contexts differently."""
     if policy.log is None or not policy.log.is_file():
         return []
     if policy.log.resolve() == Path(data.source).resolve():

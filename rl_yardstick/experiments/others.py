@@ -14,20 +14,10 @@ from typing import Any
 import gymnasium as gym
 import pandas as pd
 
+from rl_yardstick.experiments import results
 from rl_yardstick.experiments.analysis import MARGIN
 from rl_yardstick.experiments.logs import TRAINING, WORDS, Log
 from rl_yardstick.experiments.plan import PlannedRun
-from rl_yardstick.experiments.results import (
-    HIDDEN_COLUMNS,
-    OF_RUN,
-    RUN_COLUMNS,
-    Curve,
-    StudyResults,
-    evaluation_curve,
-    joined,
-    summary_row,
-    training_curve,
-)
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, Metric, StudySpec
 from rl_yardstick.pipeline.environments import MISTAKES
 from rl_yardstick.pipeline.errors import UserError
@@ -105,11 +95,10 @@ def _labelled(logs: Sequence[Log], notes: list[str], options: Options) -> list[L
 
 def results_of(
     every: Sequence[Log], notes: list[str], options: Options, root: Path
-) -> StudyResults:
+) -> results.StudyResults:
     """The logs as the results of a study in the folder ``root``; adds to the notes.
 
-    Raises:
-        UserError: if labels are missing, or are those of two runs.
+    Raises UserError if labels are missing, or are those of two runs.
     """
     counts, half = Counter(kind for log in every for kind in log.figures), len(every) // 2
     # The first that more than half of the runs have, or else most.
@@ -146,21 +135,21 @@ def results_of(
         figures=options.figures,
         figure=words,
     )
-    planned, rows, curves = list[PlannedRun](), list[dict[str, Any]](), list[Curve]()
+    planned, rows, curves = list[PlannedRun](), list[dict[str, Any]](), list[results.Curve]()
     for (agent, env), seed, log in zip(labels, seeds, logs, strict=True):
         spec, scale = places[env]
         planned.append(PlannedRun(agent, env, seed, spec, Path(log.place)))
         row, *of_run = _read(study, planned[-1], log, log.figures[kind], scale)
         rows.append(row)
         curves += of_run
-    hidden = HIDDEN_COLUMNS if any(row["full_optimum"] is not None for row in rows) else ()
-    table = pd.DataFrame(rows, columns=[*RUN_COLUMNS, *hidden])
+    hidden = results.HIDDEN_COLUMNS if any(row["full_optimum"] is not None for row in rows) else ()
+    table = pd.DataFrame(rows, columns=[*results.RUN_COLUMNS, *hidden])
     for name, of_env in table.dropna(subset="n_timesteps").groupby("environment"):
         ends = of_env.set_index("agent")["n_timesteps"].sort_values()
         if ends.iloc[-1] > 1.1 * ends.iloc[0]:
             first, last = (f"{ends.iloc[k]:,.0f} ({ends.index[k]})" for k in (0, -1))
             notes.append(f"{name}: the shortest run ends at {first}, the longest at {last}")
-    return StudyResults(study, root, table, joined(curves), tuple(planned))
+    return results.StudyResults(study, root, table, results.joined(curves), tuple(planned))
 
 
 def _place(place: str, logs: Sequence[Log], options: Options) -> tuple[TrainSpec, Yardstick | None]:
@@ -186,18 +175,18 @@ def _place(place: str, logs: Sequence[Log], options: Options) -> tuple[TrainSpec
 
 def _read(
     study: StudySpec, run: PlannedRun, log: Log, value: float, scale: Yardstick | None
-) -> tuple[dict[str, Any], Curve, Curve]:
+) -> tuple[dict[str, Any], results.Curve, results.Curve]:
     """A run's row of the summary and its curves, as those of a run folder."""
     evaluated, episodes = log.evaluations, log.episodes
     figures = {} if scale is None else scale.figures(value)
     recorded = {
-        **dict.fromkeys(OF_RUN),
+        **dict.fromkeys(results.OF_RUN),
         "final": {"mean_return": value, "exact": False, **figures},
         "best_mean_return": max(evaluated.returns, default=None),
         "n_timesteps": max([*evaluated.steps[-1:], *episodes.steps[-1:]], default=None),
     }
-    curve = evaluation_curve(run, episodes, evaluated.steps, evaluated.returns)
-    row = summary_row(study, run, recorded, episodes, curve)
+    curve = results.evaluation_curve(run, episodes, evaluated.steps, evaluated.returns)
+    row = results.summary_row(study, run, recorded, episodes, curve)
     row |= {"agent": run.agent, "environment": run.environment, "path": log.place}
     row |= {"env_id": run.spec.env_id, "last_episodes": log.figures.get(TRAINING)}
-    return row, curve, training_curve(run, episodes)
+    return row, curve, results.training_curve(run, episodes)

@@ -23,27 +23,10 @@ from rl_yardstick.experiments.study import (
     file_name,
     layered,
 )
-from rl_yardstick.pipeline.environments import (
-    check_env_id,
-    check_fit,
-    make_single_env,
-    map_name,
-    remembers,
-    usual_kwargs,
-    with_files_read,
-)
-from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline import environments, settings
+from rl_yardstick.pipeline.errors import UserError, as_user_error
 from rl_yardstick.pipeline.files import plain, read_json, write_json
 from rl_yardstick.pipeline.run import FINISHED, Run
-from rl_yardstick.pipeline.settings import (
-    BUDGETS,
-    ENV_KWARGS,
-    check_agent,
-    read_entry,
-    read_spec,
-    seeds_tuned_on,
-    training_follows,
-)
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # Fields in which runs with the same results may differ: what is written beside them.
@@ -136,7 +119,7 @@ def plan(
     specs = specs or specs_of(study)
     folders = {one.label: one.folder for one in study.environments}
     batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
-    with_memory = {environment for (_, environment), spec in specs.items() if remembers(spec)}
+    with_memory = {labels[1] for labels, spec in specs.items() if environments.remembers(spec)}
     planned = []
     for seed, (labels, spec) in product(study.seeds, specs.items()):
         n_seeds, is_batch = (counts or {}).get(labels, study.n_seeds), labels in batches
@@ -159,22 +142,19 @@ def plan(
 def specs_of(study: StudySpec) -> dict[Labels, TrainSpec]:
     """What each agent trains on each environment, but for the seed.
 
-    Raises:
-        UserError: if an agent's settings are invalid, or it does not fit an environment.
+    Raises UserError if an agent's settings are invalid, or it does not fit an environment.
     """
     _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
     _check_folders("environments", [(one.label, one.folder) for one in study.environments])
     specs = {}
     for environment, agent in product(study.environments, study.agents):
-        check_env_id(environment.env_id)
-        try:
+        environments.check_env_id(environment.env_id)
+        place = f"{agent.where}: " if agent.where else ""
+        with as_user_error(f"{place}{agent.label} on {environment.label}", UserError):
             specs[agent.label, environment.label] = spec = _train_spec(study, agent, environment)
-            check_fit(spec)
-            with closing(make_single_env(spec)) as env:
+            environments.check_fit(spec)
+            with closing(environments.make_single_env(spec)) as env:
                 found_model(env)  # a search is done once, before the workers begin
-        except UserError as error:
-            place = f"{agent.where}: " if agent.where else ""
-            raise UserError(f"{place}{agent.label} on {environment.label}: {error}") from error
     return specs
 
 
@@ -202,7 +182,7 @@ def _is_batch(spec: TrainSpec) -> bool:
         # A user's agent may be a subclass.
         if not issubclass(load_algorithm(spec.algo), TableBandit | LinearBanditAgent):
             return False
-    with closing(make_single_env(spec)) as env:
+    with closing(environments.make_single_env(spec)) as env:
         if spec.n_timesteps > (time_limit(env) or 0):
             return False
     # What a batch supports besides the agent's own arguments.
@@ -210,14 +190,14 @@ def _is_batch(spec: TrainSpec) -> bool:
 
 
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
-    check_agent(agent.algo)
+    settings.check_agent(agent.algo)
     entry, origins = _entry(agent, environment)
-    spec = read_spec(
+    spec = settings.read_spec(
         agent.algo,
         environment.env_id,
-        with_files_read(environment.env_id, entry),
+        environments.with_files_read(environment.env_id, entry),
         origins=origins,
-        map_name=map_name(environment.env_id, entry),
+        map_name=environments.map_name(environment.env_id, entry),
         pictures=False,
         eval_freq=study.eval_freq,
         eval_episodes=study.eval_episodes,
@@ -236,7 +216,6 @@ STEPS_OF_EPISODE = 100
 
 
 def _quickened(spec: TrainSpec, quick: QuickSpec) -> dict[str, int]:
-    """A small budget, in the unit of the spec's own."""
     entry = ALGORITHMS[spec.algo]
     is_table = entry.family != "library" and "compiled" in entry.engines
     steps = QUICK_TABLE_STEPS if is_table else QUICK_STEPS
@@ -255,13 +234,13 @@ def _entry(agent: AgentSpec, environment: EnvironmentSpec) -> tuple[dict[str, An
     if agent.tuned or agent.conf_file is not None:
         kwargs = own.get("env_kwargs")
         try:
-            entry = read_entry(agent.algo, environment.env_id, agent.conf_file, kwargs)
+            entry = settings.read_entry(agent.algo, environment.env_id, agent.conf_file, kwargs)
         except UserError:
             if agent.conf_file is not None or not (agent.settings or environment.settings):
                 raise
     # The environment's settings remove keys with None before the agent's settings apply.
     kept = {k: value for k, value in entry.items() if environment.settings.get(k, k) is not None}
-    return training_follows(layered(kept, own), own)
+    return settings.training_follows(layered(kept, own), own)
 
 
 # --- the record of a study ------------------------------------------------------------------------
@@ -284,19 +263,12 @@ class StudyRecord:
         """Write ``study.json``, before the first run."""
         items = self.specs.items()
         specs = [{"agent": a, "environment": e, "spec": s.model_dump()} for (a, e), s in items]
-        study = asdict(
-            self.study,
-            dict_factory=lambda items: {k: str(v) if isinstance(v, Path) else v for k, v in items},
-        )
+        study = asdict(self.study)
         write_json(root / RECORD, {"study": study, "looks": self.looks, "specs": specs})
 
     @classmethod
     def read(cls, root: Path) -> StudyRecord:
-        """Read ``study.json`` as data.
-
-        Raises:
-            UserError: if there is none, or it is not of this version.
-        """
+        """Read ``study.json`` as data; UserError if there is none, or not one of this version."""
         if not (root / RECORD).exists():
             raise UserError(f"{root} is no study: it has no {RECORD}")
         data = read_json(root / RECORD, MAX_RECORD)
@@ -324,8 +296,7 @@ def plan_of_looks(study: StudySpec, root: Path, most: int | None) -> tuple[int, 
 
     ``most`` is the largest number of seeds of an agent; None: as planned before, or ``MOST_SEEDS``.
 
-    Raises:
-        UserError: if this differs from an earlier plan, or there is nothing to decide.
+    Raises UserError if this differs from an earlier plan, or there is nothing to decide.
     """
     if len(study.agents) < 2:
         raise UserError(f"{study.name}: --until-decided takes two agents or more")
@@ -370,7 +341,7 @@ def other_settings(planned: Sequence[PlannedRun]) -> list[tuple[PlannedRun, dict
 # --- the seeds of a study on which its settings were tuned, as far as known -----------------------
 
 # Settings of length and environment of a run, which are not tuned.
-_NO_TUNING = {*BUDGETS, "env_kwargs", "eval_env_kwargs", "policy", "engine"}
+_NO_TUNING = {*settings.BUDGETS, "env_kwargs", "eval_env_kwargs", "policy", "engine"}
 
 Seeds = frozenset[int]
 
@@ -395,7 +366,7 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
     @cache
     def known(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] | None:
         with suppress(UserError):  # the file existed when the runs were planned
-            return seeds_tuned_on(algo, env_id, conf_file)
+            return settings.seeds_tuned_on(algo, env_id, conf_file)
         return None
 
     for agent, environment in product(study.agents, study.environments):
@@ -423,14 +394,14 @@ def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:
     """Whether the study has environment arguments that the entry does not have."""
     own = layered(environment.settings, agent.settings)
     places = agent.algo, environment.env_id, agent.conf_file
-    entry = read_entry(*places, own.get("env_kwargs"))
-    if entry != read_entry(*places):  # the entry of another id of the same environment
+    entry = settings.read_entry(*places, own.get("env_kwargs"))
+    if entry != settings.read_entry(*places):  # the entry of another id of the same environment
         del own["env_kwargs"]
-    merged, usual = layered(entry, own), usual_kwargs(environment.env_id)
+    merged, usual = layered(entry, own), environments.usual_kwargs(environment.env_id)
 
-    def meant(settings: Mapping[str, Any], key: str) -> Any:
-        value = settings.get(key) or {}
-        return {**usual, **value} if key in ENV_KWARGS else value
+    def meant(given: Mapping[str, Any], key: str) -> Any:
+        value = given.get(key) or {}
+        return {**usual, **value} if key in settings.ENV_KWARGS else value
 
-    keys = [key for key in (*ENV_KWARGS, "train_env_wrapper") if key in own]
+    keys = [key for key in (*settings.ENV_KWARGS, "train_env_wrapper") if key in own]
     return any(meant(merged, key) != meant(entry, key) for key in keys)

@@ -19,6 +19,7 @@ from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 from pebble import ProcessExpired, ProcessPool
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -95,13 +96,11 @@ def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
     if stop is not None:
         yield stop
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    stop = Stop().listen()
-    signal.signal(signal.SIGINT, before[signal.SIGINT])
+    before = signal.getsignal(signal.SIGTERM)
     try:
-        yield stop
+        yield Stop().listen(signal.SIGTERM)
     finally:
-        signal.signal(signal.SIGTERM, before[signal.SIGTERM])
+        signal.signal(signal.SIGTERM, before)
 
 
 # --- workers on this machine ----------------------------------------------------------------------
@@ -155,8 +154,6 @@ REGISTRATIONS: dict[str, Callable[[], object]] = {}
 
 def registrations() -> bytes:
     """The registrations, as cloudpickle copies code that stands in no module."""
-    import cloudpickle
-
     classes = [partial(name_of, cls) for cls in BY_VALUE.values()]
     return bytes(cloudpickle.dumps([*classes, *REGISTRATIONS.values()]))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,54 +17,13 @@ from rl_yardstick.experiments.bandits import STATISTICS_FILE, PullStatistics, re
 from rl_yardstick.experiments.plan import Labels, PlannedRun
 from rl_yardstick.experiments.study import AS_IT_IS, SHIPPED, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line
 from rl_yardstick.pipeline.evaluation.yardstick import with_memory
-from rl_yardstick.pipeline.files import read_arrays, read_bytes
-from rl_yardstick.pipeline.run import MEANINGS, RECORD
+from rl_yardstick.pipeline.files import MAX_TABLE, read_arrays, read_bytes
+from rl_yardstick.pipeline.run import MEANINGS, RECORD, Episodes, read_episodes
 from rl_yardstick.verdicts import steps_to_threshold
 
 # --- the files of one run -------------------------------------------------------------------------
-
-MAX_TABLE = 1 << 31  # bytes of a file of a run
-
-
-@dataclass(frozen=True)
-class Episodes:
-    """The training episodes of a run, ordered by their ends."""
-
-    steps: Floats  # steps up to the end, over all environments, shape (n,)
-    returns: Floats  # undiscounted returns, shape (n,)
-    seconds: Floats  # time since the beginning, shape (n,)
-
-
-def read_episodes(folder: Path) -> Episodes:
-    """Read the training episodes in Monitor's files."""
-    paths = sorted(folder.glob("*.monitor.csv"))
-    if not paths:
-        raise UserError(f"{folder} has no 0.monitor.csv")
-    return joined_episodes([_monitor_table(path) for path in paths])
-
-
-def joined_episodes(tables: Sequence[Floats]) -> Episodes:
-    """The episodes of all environments of a run: for each return, length, time, shape (n, 3)."""
-    # The environments step together, so all have done the same number of steps.
-    steps = np.concatenate([len(tables) * table[:, 1].cumsum() for table in tables])
-    order = np.argsort(steps, kind="stable")
-    rows = np.concatenate(tables)[order]
-    # Episodes that end in one step are written a moment after each other, in no fixed order.
-    return Episodes(steps[order], rows[:, 0], np.maximum.accumulate(rows[:, 2]))
-
-
-def _monitor_table(path: Path) -> Floats:
-    """Return, length and time of each episode, shape (n, 3)."""
-    columns = ["r", "l", "t"]
-    try:
-        # Behind a line of settings; environments may add other columns.
-        content = io.BytesIO(read_bytes(path, MAX_TABLE).partition(b"\n")[2])
-        table = pd.read_csv(content, usecols=columns, dtype=np.float64, na_filter=False)
-    except ValueError as error:
-        raise UserError(f"{path} is damaged: {one_line(error)}") from error
-    return table[columns].to_numpy()
 
 
 def read_evaluations(path: Path) -> tuple[Floats, Floats]:
@@ -79,13 +37,9 @@ def read_evaluations(path: Path) -> tuple[Floats, Floats]:
 def read_compared(folder: Path) -> dict[str, Floats]:
     """Read the columns of the diagnosis that `pipeline.evaluation.critics` wrote."""
     path = folder / "diagnosis.csv"
-    try:
-        names, *rows = csv.reader(read_bytes(path, MAX_TABLE).decode().splitlines())
-        table = np.array([[float(cell or "nan") for cell in row] for row in rows]).T
-        found = dict(zip(names, table, strict=True))
-        return {name: found[name] for name in ("timesteps", *MEANINGS) if name in found}
-    except (ValueError, KeyError) as error:
-        raise UserError(f"{path} is damaged: it is no table of numbers by step") from error
+    with as_user_error(f"{path} is damaged", ValueError):
+        table = pd.read_csv(io.BytesIO(read_bytes(path, MAX_TABLE)), dtype=np.float64)
+        return {name: table[name].to_numpy() for name in ("timesteps", *MEANINGS) if name in table}
 
 
 # --- learning curves ------------------------------------------------------------------------------
@@ -131,8 +85,7 @@ def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
 
 
 def _labels(planned: PlannedRun, kind: str) -> Curve:
-    labels = (planned.agent, planned.environment, planned.seed, kind)
-    return dict(zip(_LABELS, labels, strict=True))
+    return dict(zip(_LABELS, (*planned.labels, planned.seed, kind), strict=True))
 
 
 def joined(curves: Sequence[Curve]) -> pd.DataFrame:
@@ -237,8 +190,7 @@ def read_results(
 def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
     """Read the results of a run, or None if it is missing or not finished.
 
-    Raises:
-        UserError: if a file that a comparison reads is missing or invalid.
+    Raises UserError if a file that a comparison reads is missing or invalid.
     """
     recorded = planned.recorded()
     if not planned.is_finished_by(recorded):
@@ -263,7 +215,6 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
 
 
 def _batch_rows(planned: PlannedRun, recorded: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Make a row of the summary for each run of a batch."""
     pulls = PullStatistics.load(planned.path / STATISTICS_FILE)
     shared = {
         "n_timesteps": planned.spec.n_timesteps,

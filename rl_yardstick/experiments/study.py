@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import dataclasses as checked
 
 from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.pipeline.components import arguments_of
 from rl_yardstick.pipeline.environments import check_env_id, map_name
-from rl_yardstick.pipeline.errors import UserError, shown, unknown
-from rl_yardstick.pipeline.files import LONGEST_NAME, plain, portable_name
+from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknown
+from rl_yardstick.pipeline.files import plain, portable_name
 from rl_yardstick.pipeline.settings import (
     BUDGETS,
     ENV_KWARGS,
@@ -63,10 +64,10 @@ def symbol(setting: str) -> str:
     return _SYMBOLS.get(setting, setting)
 
 
-def file_name(label: str, longest: int = LONGEST_NAME) -> str:
-    """The label as a folder name of at most ``longest`` bytes."""
+def file_name(label: str) -> str:
+    """The label as the name of a folder."""
     label = re.sub(r"(\w) = ", lambda found: f"{_SPELT.get(found[1], found[1])}=", label)
-    return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_", longest)
+    return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_")
 
 
 def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -77,6 +78,20 @@ def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
         if isinstance(settings.get(key), dict) and isinstance(changes.get(key), dict)
     }
     return override(settings, {**changes, **merged})
+
+
+def _number(value: Any) -> Any:
+    """YAML reads 1e5 as text, and Python counts True as 1."""
+    if isinstance(value, bool):
+        raise ValueError(f"must be a number, not {shown(value)}")
+    with suppress(ValueError):
+        return float(value) if isinstance(value, str) else value
+    return value
+
+
+_Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
+_FromZero = Annotated[int, BeforeValidator(_number), Field(ge=0)]
+_Float = Annotated[float, BeforeValidator(_number)]
 
 
 @dataclass(frozen=True)
@@ -114,12 +129,13 @@ class EnvironmentSpec:
         return file_name(self.env_id.replace("/", "-") if is_id else self.label)
 
 
-@dataclass(frozen=True)
+@checked.dataclass(frozen=True, config={"extra": "forbid"})
 class QuickSpec:
     """The reduction of a study for a quick look."""
 
-    seeds: int | None = None  #: None for 2, or 1 with more than `MOST_PAIRS`
-    budget: float | None = None  #: share of each run's budget; None: see `plan.QUICK_STEPS`
+    seeds: _Count | None = None  #: None for 2, or 1 with more than `MOST_PAIRS`
+    #: The share of each run's budget; None: see `plan.QUICK_STEPS`.
+    budget: Annotated[_Float, Field(gt=0, le=1)] | None = None
 
 
 @dataclass(frozen=True)
@@ -208,15 +224,6 @@ def _as_texts(values: Sequence[Any]) -> list[str]:
 # --- study files ----------------------------------------------------------------------------------
 
 
-def _number(value: Any) -> Any:
-    """YAML reads 1e5 as text, and Python counts True as 1."""
-    if isinstance(value, bool):
-        raise ValueError(f"must be a number, not {shown(value)}")
-    with suppress(ValueError):
-        return float(value) if isinstance(value, str) else value
-    return value
-
-
 def _seconds(value: Any) -> Any:
     """A time such as 90, 90s, 10m, 2h or 1d."""
     found = re.fullmatch(r"(\d*\.?\d+)\s*(|s|m|min|h|d)", str(value).strip())
@@ -239,9 +246,6 @@ def _by_label(value: Any) -> Any:
     return {key: entry or {} for key, entry in value.items()} if isinstance(value, dict) else value
 
 
-_Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
-_FromZero = Annotated[int, BeforeValidator(_number), Field(ge=0)]
-_Float = Annotated[float, BeforeValidator(_number)]
 _Sweep = dict[str, Annotated[list[Any], Field(min_length=1)]]
 
 
@@ -279,11 +283,6 @@ class _Seeds(_Part):
     count: _Count = 10
 
 
-class _Quick(_Part):
-    seeds: _Count | None = None
-    budget: Annotated[_Float, Field(gt=0, le=1)] | None = None
-
-
 class _File(_Part):
     title: str = ""
     description: str = ""
@@ -294,7 +293,7 @@ class _File(_Part):
     ] = _Seeds()
     settings: dict[str, Any] = {}
     sweep: _Sweep = {}
-    quick: _Quick = _Quick()
+    quick: QuickSpec = QuickSpec()
     n_timesteps: _Count | None = None
     n_episodes: _Count | None = None
     tuned: bool = True
@@ -313,15 +312,14 @@ _LISTS = ("agents", "environments")
 # Keys that mean the same as fields of `StudySpec`.
 _SAME = (
     *("description", "eval_freq", "eval_episodes", "metric", "margin", "shared_randomness"),
-    *("threshold", "episodes_table", "diagnose", "run_timeout"),
+    *("threshold", "episodes_table", "diagnose", "run_timeout", "quick"),
 )
 
 
 def find_study(given: str) -> Path:
     """The given path, or that of a shipped study such as ``mine-maze``, ``studies/mine-maze.yml``.
 
-    Raises:
-        UserError: if it is a plain name, and neither exists.
+    Raises UserError if it is a plain name, and neither exists.
     """
     path = Path(given)
     if path.is_file() or path.parent not in (Path(), Path("studies")):
@@ -336,8 +334,7 @@ def find_study(given: str) -> Path:
 def read_study(path: Path) -> StudySpec:
     """Read a study file; its name is the study's name.
 
-    Raises:
-        UserError: if it cannot be read, or contains unknown or invalid settings.
+    Raises UserError if it cannot be read, or contains unknown or invalid settings.
     """
     data = read_yaml(path)
     if not (isinstance(data, dict) and all(isinstance(key, str) for key in data)):
@@ -353,10 +350,8 @@ def read_study(path: Path) -> StudySpec:
     shared, environments = layered(file.settings, given), []
     for label, entry in file.environments.items():
         env_id = label if entry.id is None else entry.id
-        try:
+        with as_user_error(str(path), UserError):
             check_env_id(env_id)
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from error
         own = {**(AS_IT_COMES if entry.as_it_comes else {}), **entry.settings}
         environments.append(EnvironmentSpec(label, env_id, layered(shared, own)))
     return StudySpec(
@@ -366,12 +361,11 @@ def read_study(path: Path) -> StudySpec:
         environments=tuple(environments),
         n_seeds=file.seeds.count,
         first_seed=file.seeds.first,
-        quick=QuickSpec(file.quick.seeds, file.quick.budget),
         **{key: getattr(file, key) for key in _SAME},
     )
 
 
-_PARTS: Mapping[tuple[str, ...], type[_Part]] = {(): _File, ("quick",): _Quick, ("seeds",): _Seeds}
+_PARTS: Mapping[tuple[str, ...], Any] = {(): _File, ("quick",): QuickSpec, ("seeds",): _Seeds}
 
 
 def _in_one_line(path: Path, error: ValidationError) -> UserError:
@@ -379,8 +373,8 @@ def _in_one_line(path: Path, error: ValidationError) -> UserError:
     first = error.errors()[0]
     *outer, key = [str(key) for key in first["loc"] if key != "[key]"]
     place, value = ": ".join([str(path), *outer]), first["input"]
-    if first["type"] == "extra_forbidden":
-        return unknown(f"{place}: unknown key", key, _PARTS[tuple(outer)].model_fields)
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        return unknown(f"{place}: unknown key", key, _PARTS[tuple(outer)].__pydantic_fields__)
     if first["type"] == "literal_error":
         return unknown(f"{place}: unknown {key}", str(value), METRICS)
     if first["type"] == "value_error":
@@ -424,8 +418,7 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
 
     Changes are typed as ``key:value``, or several of these separated by spaces.
 
-    Raises:
-        UserError: if a change cannot be parsed.
+    Raises UserError if a change cannot be parsed.
     """
     own, shipped = spec.hyperparams, shipped_hyperparams(spec)
     typed = {change: parse_assignments(change.split(), "--test") for change in changes}

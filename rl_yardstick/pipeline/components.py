@@ -30,7 +30,14 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from rl_yardstick.agents.own_classes import SMALLEST
 from rl_yardstick.agents.registry import ALGORITHMS, BY_VALUE, add_class
-from rl_yardstick.pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
+from rl_yardstick.pipeline.errors import (
+    UserError,
+    as_user_error,
+    did_you_mean,
+    one_line,
+    shown,
+    unknown,
+)
 from rl_yardstick.pipeline.spec import Component, TrainSpec
 
 # Names in files are looked up in these packages, and in modules that the user typed. Importing
@@ -183,10 +190,8 @@ def find_class(name: str, bases: tuple[type, ...], where: str, typed: list[str])
     if not any(f"{module}.".startswith(f"{package}.") for package in packages):
         fault = f"none of the packages that may be named ({', '.join(packages)})"
         raise UserError(f"{where}: {name} is in {fault}; admit others with --gym-packages")
-    try:
+    with as_user_error(f"{where}: {name}", ImportError):
         inside = importlib.import_module(module)
-    except ImportError as error:
-        raise UserError(f"{where}: {name}: {one_line(error)}") from error
     found = getattr(inside, cls, None)
     if isinstance(found, type) and issubclass(found, bases):
         return found
@@ -200,8 +205,6 @@ def build(
     component: Component, base: type, where: str, typed: list[str], folder: Path | None, *inner: Any
 ) -> Any:
     """An object of a wrapper or callback, around ``inner``; it may write into ``folder`` alone."""
-    from gymnasium.error import Error
-
     place = f"{where}: {component.name}"
     cls = find_class(component.name, (base,), where, typed)
     names = [*inspect.signature(cls).parameters]
@@ -210,10 +213,8 @@ def build(
         kwargs.setdefault("save_path", str(folder))
     if "kwargs" not in names and (foreign := next((k for k in kwargs if k not in names), None)):
         raise unknown(f"{place}: unknown argument", foreign, names[len(inner) :])
-    try:
+    with as_user_error(place, TypeError, ValueError, AssertionError, gym.error.Error):
         return cls(*inner, **build_value(kwargs, place, typed))
-    except (TypeError, ValueError, AssertionError, Error) as error:
-        raise UserError(f"{place}: {one_line(error)}") from error
 
 
 def _inside(name: str, value: Any, folder: Path | None, where: str) -> Any:
@@ -286,14 +287,11 @@ def schedule(text: str, for_library: bool) -> Any:
     from rl_yardstick.agents.common.schedules import ExponentialSchedule, library_schedule
 
     kind, *numbers = text.split("_")
-    try:
+    with as_user_error(f"{text} is no schedule such as lin_0.001 or exp_0.5_0.01", ValueError):
         start, end = [*map(float, numbers), 0.0][:2]
         if kind == "lin":
             return LinearSchedule(start, end, 1.0)
         found = ExponentialSchedule(start, end)
-    except ValueError as error:
-        fault = f"{text} is no schedule such as lin_0.001 or exp_0.5_0.01: {one_line(error)}"
-        raise UserError(fault) from error
     return library_schedule(found) if for_library else found
 
 
@@ -313,9 +311,15 @@ def action_noise(spec: TrainSpec, actions: Any) -> dict[str, Any]:
 
 TABLE = Path(__file__).parents[1] / "hyperparams" / "arguments.json"
 
-# Arguments that a flag or another key sets.
-_SET_ELSEWHERE = {"env", "seed", "device", "verbose", "tensorboard_log", "action_noise"}
-_INTERNAL = {"self", "_init_setup_model", "venv", "filename"}
+# Arguments that a flag or another key sets; rl_zoo3's files have some of them.
+SET_ELSEWHERE = {
+    "action_noise": "noise_type and noise_std",
+    "tensorboard_log": "--tensorboard-log",
+    "seed": "--seed",
+    "device": "--device",
+    "verbose": "--verbose",
+}
+_INTERNAL = {"self", "env", "_init_setup_model", "venv", "filename"}
 _PLAIN = {"bool": bool, "int": int, "float": float, "str": str, "dict": dict, "list": list}
 _WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a text"}
 _WORDS |= {"schedule": "a schedule such as lin_0.001", "dict": "a mapping", "list": "a list"}
@@ -367,7 +371,7 @@ def read_signature(name: str) -> dict[str, list[str]]:
         getattr(importlib.import_module(module), cls) if module else load_algorithm(name)
     )
     kinds = {name: sorted(_kinds(p.annotation, p.default)) for name, p in found.items()}
-    return {name: kinds[name] for name in kinds if name not in _SET_ELSEWHERE | _INTERNAL}
+    return {name: kinds[name] for name in kinds if name not in {*SET_ELSEWHERE, *_INTERNAL}}
 
 
 def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
@@ -424,7 +428,6 @@ def check_arguments(owner: str, values: Any, where: str = "") -> dict[str, Any]:
 
 
 def _checked(name: str, value: Any, kinds: list[str]) -> Any:
-    """The value, converted to one of the kinds."""
     if name == "train_freq" and not isinstance(value, list | tuple):  # or [4, "episode"]
         kinds = ["int"]
     if "any" in kinds or (value is None and "None" in kinds):

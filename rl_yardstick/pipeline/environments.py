@@ -11,17 +11,14 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
-import rl_yardstick.envs  # noqa: F401  # registers this project's environments
 from rl_yardstick.agents.registry import ALGORITHMS, fitting_algorithms, is_bandit
-from rl_yardstick.envs.wrappers import (
-    ActionMasks,
-    DiscretizeObservation,
-    FlattenToDiscrete,
-    has_masks,
-)
+from rl_yardstick.envs import wrappers  # and registers this project's environments
+from rl_yardstick.envs.bandits.logged import ReplayBandit
+from rl_yardstick.envs.grid import GridWorld, read_rows
 from rl_yardstick.pipeline.components import build, import_modules, split_id
-from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
+from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line, shown, unknown
 from rl_yardstick.pipeline.spec import TrainSpec
 
 # The time limit of evaluations if neither environment nor settings have one: a greedy policy that
@@ -69,7 +66,6 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> Env:
 
 
 def _parameters(env_id: str) -> Mapping[str, inspect.Parameter]:
-    """The arguments of the class or function that makes an environment."""
     with suppress(ImportError, AttributeError, TypeError, ValueError, gym.error.Error):
         return inspect.signature(creator_of(env_id)).parameters
     return {}
@@ -143,7 +139,7 @@ def check_fit(spec: TrainSpec) -> None:
     with closing(make_single_env(spec, training=True)) as env:
         if misfit := ALGORITHMS[spec.algo].env_misfit(env):
             spaces = env.observation_space, env.action_space
-            fitting = fitting_algorithms(*spaces, is_bandit(env), has_masks(env))
+            fitting = fitting_algorithms(*spaces, is_bandit(env), wrappers.has_masks(env))
             ways = [f"fitting agents: {', '.join(fitting)}"] if fitting else []
             ways += [f"add {flag}" for flag in _fitting_wrappers(spec, env)]
             others = "; or ".join(ways) or "no agent here fits"
@@ -156,7 +152,7 @@ def _fitting_wrappers(spec: TrainSpec, env: Env) -> Iterator[str]:
     bins: dict[str, Any] = {"bins": 10}
     if isinstance(space, gym.spaces.Box) and not space.is_bounded():
         bins |= {"low": -3.0, "high": 3.0}
-    for kind, kwargs in ((FlattenToDiscrete, {}), (DiscretizeObservation, bins)):
+    for kind, kwargs in ((wrappers.FlattenToDiscrete, {}), (wrappers.DiscretizeObservation, bins)):
         with suppress(ValueError):
             wrapped: Any = kind(env, **kwargs)
             n = getattr(wrapped.observation_space, "n", 0)
@@ -179,12 +175,10 @@ def _wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = No
     entry = ALGORITHMS.get(spec.algo)
     env = env if entry is None else entry.numbered(env)
     # Without masks, `check_fit` names the agents that fit.
-    needs_masks = entry is not None and entry.needs_masks and has_masks(env)
-    try:
+    needs_masks = entry is not None and entry.needs_masks and wrappers.has_masks(env)
+    with as_user_error("mask_actions", ValueError):
         is_masked = spec.algorithm.get("mask_actions", False) or needs_masks
-        return ActionMasks(env) if is_masked else env
-    except ValueError as error:
-        raise UserError(f"mask_actions: {one_line(error)}") from error
+        return wrappers.ActionMasks(env) if is_masked else env
 
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> Env:
@@ -265,20 +259,13 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
     So a run does not depend on the folder in which it was started.
     """
-    from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
-
-    from rl_yardstick.envs.bandits.logged import ReplayBandit
-    from rl_yardstick.envs.grid import GridWorld, read_rows
-
     found = dict(entry)
     for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
         kwargs: Any = found.get(key) if isinstance(found.get(key), dict) else {}
         desc, log = kwargs.get("desc"), kwargs.get("log")
         if isinstance(desc, str) and _makes(env_id, GridWorld | FrozenLakeEnv):
-            try:
+            with as_user_error(env_id, ValueError):
                 found[key] = {**kwargs, "desc": list(read_rows(desc))}
-            except ValueError as error:
-                raise UserError(f"{env_id}: {one_line(error)}") from error
         if isinstance(log, str) and _makes(env_id, ReplayBandit):
             found[key] = {**kwargs, "log": str(Path(log).absolute())}
     return found
@@ -286,8 +273,6 @@ def with_files_read(env_id: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def map_name(env_id: str, entry: Mapping[str, Any]) -> str:
     """The file name of the grid world map that is evaluated on; empty if it is in no file."""
-    from rl_yardstick.envs.grid import GridWorld
-
     parts = [entry.get(key) or {} for key in ("eval_env_kwargs", "env_kwargs")]
     given: Any = next((part["desc"] for part in parts if "desc" in part), None)
     is_path = isinstance(given, str) and "\n" not in given and _makes(env_id, GridWorld)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 import re
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 _SHORT_LIST = 12
 # Other names of hyperparameters, too different in spelling to be found by similarity.
@@ -67,6 +68,15 @@ def one_line(error: BaseException) -> str:
         return " ".join(str(error).split()) or type(error).__name__
     except Exception:  # noqa: BLE001  # a stranger's `__str__` can fail in any way
         return type(error).__name__
+
+
+@contextmanager
+def as_user_error(what: str, *kinds: type[BaseException]) -> Iterator[None]:
+    """Errors of these kinds in the block become a `UserError`: ``what``, and their message."""
+    try:
+        yield
+    except kinds as error:
+        raise UserError(f"{what}: {one_line(error)}") from error
 
 
 def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:

@@ -14,24 +14,24 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.safe_files.files import UnsafeFileError, content_of
+from rl_yardstick.pipeline.errors import UserError, as_user_error
+from rl_yardstick.safe_files.files import UnsafeFileError, content_of, read_members
 
 MAX_TEXT = 10_000_000  # bytes of a settings file
-MAX_ARRAYS = 1 << 31  # bytes of an archive of arrays
+MAX_TABLE = 1 << 31  # bytes of a table, or of an archive of arrays
 LONGEST_NAME = 100  # bytes; Windows limits a whole path to 260 characters
 
 _REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
 _DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d) *(\.|$)", re.IGNORECASE)  # of Windows
 
 
-def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
-    """The name, or a similar one of at most ``longest`` bytes that is valid on every system."""
+def portable_name(name: str) -> str:
+    """The name, or a similar one of at most `LONGEST_NAME` bytes that is valid on every system."""
     plain = _DEVICE.sub(r"\1_", _REFUSED_SIGNS.sub("_", name)) or "_"
-    if plain == name and len(name.encode()) <= longest:
+    if plain == name and len(name.encode()) <= LONGEST_NAME:
         return name
     digest = hashlib.sha256(name.encode(errors="replace")).hexdigest()[:8]
-    kept = plain.encode(errors="replace")[: longest - len(digest) - 1]
+    kept = plain.encode(errors="replace")[: LONGEST_NAME - len(digest) - 1]
     return f"{kept.decode(errors='ignore')}-{digest}"
 
 
@@ -55,10 +55,8 @@ def read_text(path: Path, limit: int = MAX_TEXT) -> str:
 
 def read_json(path: Path, limit: int = MAX_TEXT) -> Any:
     """The content of a JSON file."""
-    try:
+    with as_user_error(f"{path} is no valid JSON", ValueError, RecursionError):
         return json.loads(read_text(path, limit))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is no valid JSON: {error}") from error
 
 
 def read_arrays(
@@ -70,12 +68,10 @@ def read_arrays(
     """
     from numpy.lib.format import read_array
 
-    from rl_yardstick.safe_files.files import read_members
-
     found: dict[str, Any] = {}
     lengths: dict[str, int] = {}
-    try:
-        members = read_members(read_bytes(path, MAX_ARRAYS))
+    with as_user_error(f"{path} is damaged", ValueError, LookupError, OverflowError, MemoryError):
+        members = read_members(read_bytes(path, MAX_TABLE))
         for name in [n for n in shapes if n not in optional or f"{n}.npy" in members]:
             array = read_array(io.BytesIO(members[f"{name}.npy"]), allow_pickle=False)
             sizes = zip(shapes[name].split(), array.shape, strict=True)
@@ -83,8 +79,6 @@ def read_arrays(
             if array.dtype.kind not in "biuf" or tuple(wanted) != array.shape:
                 raise ValueError(f"{name} has another shape or kind")
             found[name] = array
-    except (ValueError, LookupError, OverflowError, MemoryError) as error:
-        raise UserError(f"{path} is damaged: {error}") from error
     return found
 
 
@@ -133,6 +127,8 @@ def plain(value: Any, infinities: Mapping[float, str] | None = None) -> Any:
             return None if math.isnan(value) else (infinities or {}).get(value, float(value))
         case None | bool() | int() | str():
             return value
+        case Path():
+            return str(value)
         case _:
             return plain(value.tolist(), infinities)  # of NumPy
 

@@ -20,11 +20,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from rl_yardstick.pipeline.components import arguments_of, check_typed, module_name
 from rl_yardstick.pipeline.environments import check_env_id
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import UserError, as_user_error, one_line
 from rl_yardstick.pipeline.files import read_bytes
 from rl_yardstick.pipeline.run import RECORD, Run, numbered_runs, statistics_beside
 from rl_yardstick.pipeline.settings import check_agent, read_entry, read_saved, special_settings
 from rl_yardstick.pipeline.spec import TrainSpec, validated
+from rl_yardstick.safe_files.files import first_look
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -164,8 +165,6 @@ def replay_buffer_of(model: Path) -> Path | None:
 
 def zip_data(path: Path) -> dict[str, Any]:
     """The JSON in an agent's zip; pickles in it stay text."""
-    from rl_yardstick.safe_files.files import first_look
-
     content = read_bytes(path, MAX_MODEL)
     try:
         return first_look(content)
@@ -323,10 +322,8 @@ def _as_saved(spec: TrainSpec, data: Mapping[str, Any], statistics: Path | None)
 def _read_statistics(path: Path) -> Any:
     from rl_yardstick.safe_files.buffers_and_statistics import read_normalization
 
-    try:
+    with as_user_error(f"{path} cannot be read", ValueError):
         return read_normalization(read_bytes(path, MAX_MODEL))
-    except ValueError as error:
-        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
 
 
 def take_statistics(env: Any, path: Path) -> None:
@@ -381,10 +378,8 @@ def load_to_train(spec: TrainSpec, env: VecEnv, **arguments: Any) -> BaseAlgorit
     if buffer is None or not issubclass(load_algorithm(spec.algo), OffPolicyAlgorithm):
         return agent  # type: ignore[no-any-return]
     content, wanted = io.BytesIO(read_bytes(buffer, MAX_MODEL)), agent.replay_buffer
-    try:
+    with as_user_error(f"{buffer} cannot be read", ValueError, AssertionError):
         load_replay_buffer(agent, content, classes={MaskedReplayBuffer, type(wanted)})
-    except (ValueError, AssertionError) as error:
-        raise UserError(f"{buffer} cannot be read: {one_line(error)}") from error
     found, needed = (
         f"{type(one).__name__} of n_envs:{one.n_envs} and n_steps:{getattr(one, 'n_steps', 1)}"
         for one in (agent.replay_buffer, wanted)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,9 +17,11 @@ from rl_yardstick.envs.drawing import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, S
 from rl_yardstick.envs.drawing import ORANGE as AMBER
 from rl_yardstick.envs.layout import GOAL, PRIZE, START, TRAP, WALL, GridLayout
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
+from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 from rl_yardstick.pipeline.files import replacing
-from rl_yardstick.safe_files.files import NO_LIMIT, content_of
+from rl_yardstick.pipeline.run import read_episodes
+from rl_yardstick.safe_files.files import NO_LIMIT
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -46,7 +47,6 @@ def draw(folder: Path, parts: Any) -> None:
     spec, evaluation, agent = parts.spec, parts.evaluation, parts.agent
     if not spec.pictures:
         return
-    from rl_yardstick.pipeline.environments import training_changes
     from rl_yardstick.pipeline.evaluation.value_maps import value_map
 
     with parts.run.console.status("drawing the pictures"):
@@ -95,19 +95,10 @@ MAX_POINTS = 5000
 
 def read_monitors(folder: Path) -> tuple[Floats, Floats]:
     """For each training episode, its last step counted over all environments, and its return."""
-    contents = [content_of(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
-    rows = [
-        np.loadtxt(BytesIO(content), delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
-        for content in contents
-        if content.count(b"\n") > 2
-    ]
-    if not rows:
+    if not any(folder.glob("*.monitor.csv")):
         return np.empty(0), np.empty(0)
-    # The environments step together, so all have done the same number of steps.
-    steps = np.concatenate([len(contents) * np.cumsum(table[:, 1]) for table in rows])
-    returns = np.concatenate([table[:, 0] for table in rows])
-    order = np.argsort(steps, kind="stable")
-    return steps[order], returns[order]
+    found = read_episodes(folder, NO_LIMIT)
+    return found.steps, found.returns
 
 
 def draw_learning_curve(
@@ -383,7 +374,6 @@ def _scaled(ends: tuple[float, float], names: tuple[str, ...]) -> tuple[Normaliz
 
 
 def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar: str) -> None:
-    """Draw both sides, with a colour bar for one of them."""
     from matplotlib.cm import ScalarMappable
 
     found = sides[0].shown
@@ -463,7 +453,6 @@ def _panels(layout: GridLayout, n_layers: int) -> tuple[Figure, list[list[Axes]]
 
 
 def _legend(found: ValueMap, scale: Normalize) -> Iterator[Artist]:
-    """Make a legend entry for each kind of mark in the picture."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

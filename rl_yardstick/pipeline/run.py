@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import re
 import shutil
 import signal
 import threading
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from types import FrameType
 from typing import Any, Self
+from warnings import catch_warnings
 
+import numpy as np
+import yaml
 from filelock import FileLock, Timeout
 from pydantic import ValidationError
 from rich.console import Console
 
-from rl_yardstick.pipeline.errors import Stopped, UserError
-from rl_yardstick.pipeline.files import read_json, replacing, write_json, write_text
+from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline import files
+from rl_yardstick.pipeline.errors import Stopped, UserError, as_user_error
 from rl_yardstick.pipeline.spec import TrainSpec
 
 RUNNING, FINISHED, INTERRUPTED, FAILED = "running", "finished", "interrupted", "failed"
@@ -36,10 +41,10 @@ class Stop:
 
     number = 0  # of the first signal
 
-    def listen(self) -> Self:
+    def listen(self, *numbers: int) -> Self:
         """Take over the signals, in a process's main thread; elsewhere Python delivers none."""
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in numbers or (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, self._noticed)
         return self
 
@@ -117,7 +122,7 @@ class Run:
     def recorded(self) -> dict[str, Any]:
         """The content of ``run.json``; empty if there is none yet."""
         path = self.path / RECORD
-        data = read_json(path, MAX_RECORD) if path.exists() else {}
+        data = files.read_json(path, MAX_RECORD) if path.exists() else {}
         return data if isinstance(data, dict) else {}
 
     def spec(self) -> TrainSpec:
@@ -130,24 +135,21 @@ class Run:
 
     def begin(self, spec: TrainSpec, args: Mapping[str, Any], command: str) -> None:
         """Write what the run is about to do: settings for rl_zoo3, and ``run.json``."""
-        import yaml
-
         settings = self.path / spec.env_name
         settings.mkdir(exist_ok=True)
         # rl_zoo3's tools use env_kwargs in args.yml before those in config.yml.
         args = {**args, "env_kwargs": spec.env_kwargs or None}
         for name, data in (("config.yml", spec.hyperparams), ("args.yml", args)):
-            plain = json.loads(json.dumps(data, default=str))  # no paths
-            text = yaml.dump(plain, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper))
-            write_text(settings / name, text)
-        write_text(settings / "command.txt", f"{command}\n")
+            dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+            files.write_text(settings / name, yaml.dump(files.plain(data), Dumper=dumper))
+        files.write_text(settings / "command.txt", f"{command}\n")
         self.record(spec, RUNNING)
 
     def record(self, spec: TrainSpec, state: str, **figures: Any) -> None:
         """Write ``run.json``; with the state ``finished`` it is the last file of a run."""
         known = {"state": state, "env_name": spec.env_name, "spec": spec.model_dump()}
         facts = {"versions": versions(), "machine": machine(), "pid": os.getpid()}
-        write_json(self.path / RECORD, {**known, **facts, **figures})
+        files.write_json(self.path / RECORD, {**known, **facts, **figures})
 
 
 def save_agent(agent: Any, path: Path, buffer: Path | None = None) -> None:
@@ -155,14 +157,36 @@ def save_agent(agent: Any, path: Path, buffer: Path | None = None) -> None:
     from rl_yardstick.pipeline.finite_numbers import check_model
 
     check_model(agent)
-    with replacing(path) as beside:
+    with files.replacing(path) as beside:
         agent.save(beside)
     if (statistics := agent.get_vec_normalize_env()) is not None:
-        with replacing(statistics_beside(path)) as beside:
+        with files.replacing(statistics_beside(path)) as beside:
             statistics.save(str(beside))
     if buffer is not None and getattr(agent, "replay_buffer", None) is not None:
-        with replacing(buffer) as beside:
+        with files.replacing(buffer) as beside:
             agent.save_replay_buffer(beside)
+
+
+@contextmanager
+def tracked(run: Run, spec: TrainSpec, where: Mapping[str, Any]) -> Iterator[None]:
+    """Send what TensorBoard is told to Weights & Biases, until the block ends.
+
+    ``where`` has entity, project, group and tags of ``wandb.init``. With ``WANDB_MODE=offline`` the
+    records stay in the run folder. Raises UserError if it refuses, e.g. without a key.
+    """
+    import wandb
+
+    with as_user_error("--track", wandb.Error):
+        tracking = wandb.init(
+            name=f"{spec.algo}/{run.path.name}",
+            dir=run.path,
+            config={"algo": spec.algo, "env": spec.env_id, "seed": spec.seed, **spec.hyperparams},
+            sync_tensorboard=True,  # its own integration
+            settings=wandb.Settings(console="off", silent=run.console.quiet),
+            **where,
+        )
+    with tracking:
+        yield
 
 
 def statistics_beside(model: Path) -> Path:
@@ -172,6 +196,39 @@ def statistics_beside(model: Path) -> Path:
     if model.stem == "best_model":
         return model.with_name("best_model_vecnormalize.pkl")
     return model.with_suffix("") / "vecnormalize.pkl"
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The training episodes of a run, ordered by their ends; each array has the shape (n,)."""
+
+    steps: Floats  # steps up to the end, over all environments
+    returns: Floats  # undiscounted returns
+    seconds: Floats  # time since the beginning
+
+
+def read_episodes(folder: Path, limit: int = files.MAX_TABLE) -> Episodes:
+    """Read the training episodes in Monitor's files, each of at most ``limit`` bytes."""
+    tables = []
+    form: Any = {"delimiter": ",", "skiprows": 2, "usecols": (0, 1, 2), "ndmin": 2}
+    for path in sorted(folder.glob("*.monitor.csv")):
+        content = BytesIO(files.read_bytes(path, limit))
+        with as_user_error(f"{path} is damaged", ValueError), catch_warnings(action="ignore"):
+            # Without an episode it has two lines, and NumPy warns.
+            tables.append(np.loadtxt(content, **form).reshape(-1, 3))
+    if not tables:
+        raise UserError(f"{folder} has no 0.monitor.csv")
+    return joined_episodes(tables)
+
+
+def joined_episodes(tables: Sequence[Floats]) -> Episodes:
+    """The episodes of all environments of a run: for each return, length, time, shape (n, 3)."""
+    # The environments step together, so all have done the same number of steps.
+    steps = np.concatenate([len(tables) * table[:, 1].cumsum() for table in tables])
+    order = np.argsort(steps, kind="stable")
+    rows = np.concatenate(tables)[order]
+    # Episodes that end in one step are written a moment after each other, in no fixed order.
+    return Episodes(steps[order], rows[:, 0], np.maximum.accumulate(rows[:, 2]))
 
 
 def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:

@@ -18,18 +18,14 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
 
 from rl_yardstick.agents.own_classes import SMALLEST, fault_of
 from rl_yardstick.agents.registry import ALGORITHMS
-from rl_yardstick.pipeline.components import (
-    AUTO,
-    WRAPPERS,
-    arguments_of,
-    check_arguments,
-    digests_of,
-)
-from rl_yardstick.pipeline.errors import UserError, one_line, shown, unknown
+from rl_yardstick.envs.known_models import time_limit, transition_model
+from rl_yardstick.pipeline import components, environments
+from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknown
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec, validated
 
@@ -40,14 +36,6 @@ COMPONENTS = ("env_wrapper", "train_env_wrapper", "vec_env_wrapper", "callback")
 ENV_KWARGS = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 _OTHERS = ("n_envs", "normalize", "frame_stack", "monitor_kwargs", "noise_type", "noise_std")
 SPECIAL = (*BUDGETS, *COMPONENTS, *ENV_KWARGS, *_OTHERS)
-# What rl_zoo3's files have and what is decided elsewhere here.
-_SET_ELSEWHERE = {
-    "action_noise": "noise_type and noise_std",
-    "tensorboard_log": "--tensorboard-log",
-    "seed": "--seed",
-    "device": "--device",
-    "verbose": "--verbose",
-}
 _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 
 
@@ -85,10 +73,9 @@ def read_yaml(path: Path) -> Any:
 @lru_cache  # a file is read for each agent, environment and trial
 def parse_yaml(text: str, where: str) -> Any:
     """The plain values that a text in YAML spells."""
-    try:
+    kinds = yaml.YAMLError, ValueError, TypeError, RecursionError
+    with as_user_error(f"{where} is no valid YAML", *kinds):
         return yaml.load(text, Loader=_Loader)  # noqa: S506  # a safe loader
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise UserError(f"{where} is no valid YAML: {' '.join(str(error).split())}") from error
 
 
 def _check_names(found: Any, words: str) -> dict[str, Any]:
@@ -124,22 +111,18 @@ def read_entry(
     is used: for CliffWalking-v1 with ``is_slippery: True``, the entry of CliffWalkingSlippery-v1.
     Another file may also be a single entry, or the parameters of a trial; see `from_trial`.
     """
-    from gymnasium import registry
-
     if (entries := _read_file(algo, path)) is None:
         return {}
-    key, own = _key(entries, env_id), registry.get(env_id)
+    key, own = _key(entries, env_id), gym.registry.get(env_id)
     path = path or HYPERPARAMS / f"{algo}.yml"
     if env_kwargs and own is not None:
         meant = own.entry_point, {**own.kwargs, **env_kwargs}, own.max_episode_steps
-        named = [registry[name] for name in entries if name in registry]
+        named = [gym.registry[name] for name in entries if name in gym.registry]
         same = [s.id for s in named if (s.entry_point, s.kwargs, s.max_episode_steps) == meant]
         key = same[0] if same else key
-    if key is None and not {*arguments_of(algo), *SPECIAL}.isdisjoint(entries):
-        try:  # one entry without an id, as in rl_zoo3's config.yml
-            return from_trial(algo, entries)
-        except (TypeError, LookupError) as error:
-            raise UserError(f"{path}: these are no hyperparameters: {one_line(error)}") from error
+    if key is None and not {*components.arguments_of(algo), *SPECIAL}.isdisjoint(entries):
+        with as_user_error(f"{path}: these are no hyperparameters", TypeError, LookupError):
+            return from_trial(algo, entries)  # one without an id, as in rl_zoo3's config.yml
     if key is None:
         way_out = "give hyperparameters with -params, or another file with --conf-file"
         raise UserError(f"{unknown(f'{path}: no entry for', env_id, entries, n=3)}; {way_out}")
@@ -367,23 +350,24 @@ def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -
     if "noise_type" not in entry:  # then noise_std is an argument of some agents
         special.pop("noise_std", None)
     rest = {key: value for key, value in entry.items() if key not in special}
+    known = components.arguments_of(algo)
     for key in rest:
-        if key in _SET_ELSEWHERE:
-            raise UserError(f"{key} is set by {_SET_ELSEWHERE[key]}, not here")
-        if key not in arguments_of(algo):
-            raise unknown(f"{algo} has no hyperparameter", key, [*arguments_of(algo), *SPECIAL])
-    for key in WRAPPERS:
+        if key in components.SET_ELSEWHERE:
+            raise UserError(f"{key} is set by {components.SET_ELSEWHERE[key]}, not here")
+        if key not in known:
+            raise unknown(f"{algo} has no hyperparameter", key, [*known, *SPECIAL])
+    for key in components.WRAPPERS:
         if special.get(key) is not None:
-            special[key] = check_arguments(key, special[key], f"{key}: ")
-    algorithm = check_arguments(algo, rest)
+            special[key] = components.check_arguments(key, special[key], f"{key}: ")
+    algorithm = components.check_arguments(algo, rest)
     if special.get("normalize") is not None and isinstance(algorithm.get("gamma"), float):
         # As in rl_zoo3, rewards are normalised with the agent's discount.
         special["normalize"].setdefault("gamma", algorithm["gamma"])
-    asked = [key for key in AUTO if algorithm.get(key) == "auto"]
+    asked = [key for key in components.AUTO if algorithm.get(key) == "auto"]
     plain = {key: value for key, value in algorithm.items() if key not in asked}
     if str(special.get("n_timesteps")).startswith("auto"):
         asked.insert(0, str(special.pop("n_timesteps")))
-    code = digests_of(fields.get("gym_packages", ()), algo, env_id)
+    code = components.digests_of(fields.get("gym_packages", ()), algo, env_id)
     found = {"algo": algo, "env_id": env_id, "algorithm": plain, "code": code}
     found |= {**special, **fields}
     spec = validated(found)
@@ -428,17 +412,12 @@ _STEPS = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
 def _with_numbers(spec: TrainSpec, asked: list[str]) -> TrainSpec:
     """Settings of tables, from the evaluation environment."""
-    from gymnasium.spaces import Discrete
-
-    from rl_yardstick.envs.known_models import time_limit, transition_model
-    from rl_yardstick.pipeline.environments import check_fit, make_single_env
-
-    check_fit(spec)
+    environments.check_fit(spec)
     where, n_timesteps = f"{spec.algo} on {spec.env_id}", spec.n_timesteps
     origins, algorithm = dict(spec.origins), dict(spec.algorithm)
-    with closing(make_single_env(spec)) as env:
+    with closing(environments.make_single_env(spec)) as env:
         spaces = env.observation_space, env.action_space
-        counts = [int(space.n) for space in spaces if isinstance(space, Discrete)]
+        counts = [int(space.n) for space in spaces if isinstance(space, gym.spaces.Discrete)]
         if len(counts) < 2:
             raise UserError(f"{where}: auto needs Discrete observations and actions")
         n_pairs = counts[0] * counts[1]
@@ -475,15 +454,12 @@ def _with_numbers(spec: TrainSpec, asked: list[str]) -> TrainSpec:
 
 def _with_rewards(spec: TrainSpec) -> TrainSpec:
     """The arguments of training wrappers, from the rewards that reach them."""
-    from rl_yardstick.envs.known_models import transition_model
-    from rl_yardstick.pipeline.environments import make_single_env
-
     wrappers, told = list(spec.train_env_wrapper), []
     for place, wrapper in enumerate(wrappers):
         kwargs = dict(wrapper.kwargs)
         for key in [key for key in ("scale", "min_reward") if kwargs.get(key) == "auto"]:
             inner = spec.changed(train_env_wrapper=wrappers[:place])
-            with closing(make_single_env(inner, training=True)) as env:
+            with closing(environments.make_single_env(inner, training=True)) as env:
                 model = transition_model(env)
             if model is None:
                 raise UserError(f"{spec.env_id}: {key}: auto needs an environment with a model")

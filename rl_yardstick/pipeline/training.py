@@ -121,15 +121,14 @@ class Training:
         exact = judge.exact
         self.can_be_explained = exact is not None  # its gap can be split into parts
         frequencies = callbacks.evaluation_frequencies(spec, agent, is_bandit and exact is None)
-        critics = None
+        critics: Any = None
         if spec.diagnose:
-            found: Any = "there are no evaluations during this training"
+            critics = "there are no evaluations during this training"
             if max(frequencies) > 0:
-                found = recorder_of(run.path / "diagnosis.csv", spec, agent)
-            if isinstance(found, str):
-                run.console.print(f"no diagnosis: {found}", style="dim", markup=False)
-            else:
-                critics = found
+                critics = recorder_of(run.path / "diagnosis.csv", spec, agent)
+        if isinstance(critics, str):
+            run.console.print(f"no diagnosis: {critics}", style="dim", markup=False)
+            critics = None
         maps = None
         if exact is not None and (spec.watch_learning or exact.layout is not None):
             maps = ValueMapRecorder(run.path / "value_maps.npz", exact)

@@ -6,20 +6,17 @@ Apart from other tables, because it has to be printed before anything heavy is l
 from __future__ import annotations
 
 from contextlib import closing, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
+from rich.console import Console
 from rich.table import Column, Table
 
 from rl_yardstick.agents.registry import ALGORITHMS, fitting_algorithms, is_bandit
 from rl_yardstick.envs.wrappers import has_masks
 from rl_yardstick.pipeline.environments import MISTAKES, check_env_id, make_env
 from rl_yardstick.pipeline.settings import entry_names
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec
 
 # Agents for a comparison with a run, the first that fits; these train quickly.
 RIVALS = ("thompson", "ucb", "qlearning", "sarsa", "semi_gradient_sarsa", "sac", "ppo")

@@ -191,7 +191,6 @@ def _legend(analysis: StudyAnalysis) -> str:
 
 
 def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, Cell]:
-    """The cell of each agent that has a run."""
     best = environment.best.agents
     is_for_all = len(best) == len(environment.agents)  # none is worse
     if is_for_all or words.none_has_learnt(analysis.study, environment):

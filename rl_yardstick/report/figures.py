@@ -12,42 +12,19 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib import ticker
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.textpath import TextToPath
-from matplotlib.ticker import (
-    EngFormatter,
-    FixedLocator,
-    FuncFormatter,
-    NullLocator,
-    PercentFormatter,
-)
 from matplotlib.transforms import offset_copy
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis
 from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, StudySpec, file_name
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.files import replacing
-from rl_yardstick.report.series import (
-    COLOURS,
-    DASHES,
-    DWARFED,
-    N_KINDS,
-    SPREAD,
-    ArmSeries,
-    Belief,
-    Curve,
-    Dash,
-    EnvironmentSeries,
-    Grid,
-    LearningCurves,
-    Mark,
-    PullSeries,
-    StudySeries,
-    mean_regret,
-    regret_of_runs,
-)
+from rl_yardstick.report import series
+from rl_yardstick.report.series import EnvironmentSeries, Mark, PullSeries, StudySeries
 from rl_yardstick.report.words import enumeration, number, with_best_mean
 
 if TYPE_CHECKING:
@@ -59,7 +36,7 @@ if TYPE_CHECKING:
 # A figure is as wide as the text of a page, so that it is printed unscaled. Long labels wrap.
 
 # Matplotlib's names for Plotly's line styles.
-_LINE_STYLES: Mapping[Dash, str] = {"solid": "-", "dash": "--", "dashdot": "-.", "dot": ":"}
+_LINE_STYLES: Mapping[series.Dash, str] = {"solid": "-", "dash": "--", "dashdot": "-.", "dot": ":"}
 
 REFERENCE = "0.35"  # the grey of reference lines
 MOST_BANDS = 5  # the largest number of shaded intervals in a figure: more would hide each other
@@ -88,12 +65,12 @@ LOG = "(log scale)"
 
 def line_style(mark: Mark) -> dict[str, Any]:
     """Colour and line style of an agent, as Matplotlib's functions take them."""
-    return {"color": COLOURS[mark.colour], "linestyle": _LINE_STYLES[mark.dash]}
+    return {"color": series.COLOURS[mark.colour], "linestyle": _LINE_STYLES[mark.dash]}
 
 
-def fill_band(axes: Axes, band: Curve, mark: Mark, alpha: float = 0.2) -> None:
+def fill_band(axes: Axes, band: series.Curve, mark: Mark, alpha: float = 0.2) -> None:
     """Shade the interval of a curve."""
-    style = {"color": COLOURS[mark.colour], "alpha": alpha, "linewidth": 0}
+    style = {"color": series.COLOURS[mark.colour], "alpha": alpha, "linewidth": 0}
     axes.fill_between(band.x, band.low, band.high, **style)  # type: ignore[arg-type]
 
 
@@ -206,27 +183,26 @@ _PULLS = f"pulls {LOG}"
 UPRIGHT = 6  # the largest number of names that fit side by side
 
 
-def draw_rewards(upper: Axes, lower: Axes, series: PullSeries, place: str, marks: Marks) -> None:
+def draw_rewards(upper: Axes, lower: Axes, bandit: PullSeries, place: str, marks: Marks) -> None:
     """Average reward and share of optimal arms by pull: figure 2.2 of Sutton and Barto."""
-    rewards = _by_pull(series, "reward", marks)
-    if series.best is not None:
+    rewards = _by_pull(bandit, "reward", marks)
+    if bandit.best is not None:
         pulls = rewards[0][1][[0, -1]]
         style = {"color": REFERENCE, "linestyle": "-"}
-        rewards.append(("best possible", pulls, np.full(2, series.best), style))
+        rewards.append(("best possible", pulls, np.full(2, bandit.best), style))
     _draw_lines(upper, rewards)
     lettering(
-        upper, title=f"{place}, {series.n_runs:,} runs", x="pulls", y="average reward per pull"
+        upper, title=f"{place}, {bandit.n_runs:,} runs", x="pulls", y="average reward per pull"
     )
     lower.set_ylim(0, 1)
-    _draw_lines(lower, _by_pull(series, "optimal", marks))
-    lower.yaxis.set_major_formatter(PercentFormatter(1))
+    _draw_lines(lower, _by_pull(bandit, "optimal", marks))
+    lower.yaxis.set_major_formatter(ticker.PercentFormatter(1))
     lettering(lower, x="pulls", y="runs that pull a best arm")
     shared_legend(upper, lower)
 
 
-def _by_pull(series: PullSeries, what: str, marks: Marks) -> list[Line]:
-    """A statistic as a line for each agent that has it."""
-    found = [(agent, p, getattr(p, what)) for agent, p in series.pulls.items()]
+def _by_pull(bandit: PullSeries, what: str, marks: Marks) -> list[Line]:
+    found = [(agent, p, getattr(p, what)) for agent, p in bandit.pulls.items()]
     known = [one for one in found if np.isfinite(one[-1]).any()]
     return [(agent, p.pulls, y, line_style(marks[agent])) for agent, p, y in known]
 
@@ -236,7 +212,7 @@ def _draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
         axes.plot(x, y, label=name, linewidth=1, **style)  # type: ignore[arg-type]
 
 
-def draw_regret(places: Sequence[Axes], series: PullSeries, place: str, marks: Marks) -> None:
+def draw_regret(places: Sequence[Axes], bandit: PullSeries, place: str, marks: Marks) -> None:
     """Cumulative regret on a logarithmic axis of pulls, with the bounds from theory.
 
     On the second axes, if there are any, simple regret: the best mean reward less that of the arm
@@ -246,21 +222,22 @@ def draw_regret(places: Sequence[Axes], series: PullSeries, place: str, marks: M
     for each in places:
         each.set_xscale("log")
     for each in others:
-        _draw_lines(each, _by_pull(series, "simple_regret", marks))
+        _draw_lines(each, _by_pull(bandit, "simple_regret", marks))
         title = "of recommending the arm pulled most"
         lettering(each, title=title, x=_PULLS, y="simple regret (reward per pull)")
-    lines = _by_pull(series, "cumulative_regret", marks)
+    lines = _by_pull(bandit, "cumulative_regret", marks)
     # The interval of the mean and the spread of runs, or fewer bands where agents are many.
-    kinds = ((mean_regret, 0.3), (regret_of_runs, 0.08))[: MOST_BANDS // len(series.pulls)]
-    for agent, pulls in series.pulls.items():
+    kinds = [(series.mean_regret, 0.3), (series.regret_of_runs, 0.08)]
+    kinds = kinds[: MOST_BANDS // len(bandit.pulls)]
+    for agent, pulls in bandit.pulls.items():
         for curve_of, alpha in kinds:
             fill_band(axes, curve_of(pulls), marks[agent], alpha)
-    words = ("", " with its 95 % interval", f", its 95 % interval, and {SPREAD} of the runs")
-    title = f"{place}: mean of {series.n_runs:,} runs{words[len(kinds)]}"
+    words = ("", " with its 95 % interval", f", its 95 % interval, and {series.SPREAD} of the runs")
+    title = f"{place}: mean of {bandit.n_runs:,} runs{words[len(kinds)]}"
     highest = max(axes.dataLim.y1, *(np.nanmax(y) for _, _, y, _ in lines))
-    if series.bounds is not None:
+    if bandit.bounds is not None:
         # A bound far above is cut, and an agent that never learns does not flatten the rest.
-        bounds, shown = series.bounds, series.bounds.auer <= 1.5 * highest
+        bounds, shown = bandit.bounds, bandit.bounds.auer <= 1.5 * highest
         for name, x, y, dash in (
             ("Auer's bound for UCB1", bounds.pulls[shown], bounds.auer[shown], "--"),
             ("Lai-Robbins slope", bounds.pulls, bounds.lai_robbins, ":"),
@@ -273,12 +250,12 @@ def draw_regret(places: Sequence[Axes], series: PullSeries, place: str, marks: M
     shared_legend(*places)
 
 
-def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
+def draw_arms(upper: Axes, lower: Axes, arms: series.ArmSeries, marks: Marks) -> None:
     """By context, each arm's share of the pulls, and the final estimates of its mean."""
     places = np.arange(len(arms.names))
     width = 0.8 / len(arms.shares)
     for index, (agent, shares) in enumerate(arms.shares.items()):
-        colour = COLOURS[marks[agent].colour]
+        colour = series.COLOURS[marks[agent].colour]
         offset = places + (index - (len(arms.shares) - 1) / 2) * width
         upper.bar(offset, shares, width, color=colour, label=agent)
         if agent in arms.estimates:
@@ -290,20 +267,20 @@ def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
         names = [name.replace(", ", "\n" if upright else ", ") for name in arms.names]
         axes.set_xticks(places, names, rotation=0 if upright else 90)
     upper.set_ylim(0, 1)
-    upper.yaxis.set_major_formatter(PercentFormatter(1))
+    upper.yaxis.set_major_formatter(ticker.PercentFormatter(1))
     lettering(upper, title="pulls, by context", y="share of the pulls")
     title = "final estimates, mean and spread over runs; lines across are the truth"
     lettering(lower, title=title, y="mean reward per pull")
     shared_legend(upper)
 
 
-def draw_belief(panels: Sequence[Axes], belief: Belief) -> None:
+def draw_belief(panels: Sequence[Axes], belief: series.Belief) -> None:
     """An agent's posterior of each arm in its first run, a panel per context and moment."""
     n_moments, n_contexts, n_arms, _ = belief.densities.shape
     for panel, axes in enumerate(panels):
         context, moment = divmod(panel, n_moments)
         for arm in range(n_arms):
-            colour = COLOURS[arm % N_KINDS]
+            colour = series.COLOURS[arm % series.N_KINDS]
             y = belief.densities[moment, context, arm]
             axes.plot(belief.points, y, linewidth=1.2, label=f"arm {arm}", color=colour)
             mean = belief.true_means[context][arm]
@@ -328,7 +305,7 @@ _BETWEEN = "; the optimum lies between the lines"
 FEW = 3  # the largest number of names in a legend's entry
 
 
-def panels(curves: Mapping[str, LearningCurves]) -> list[tuple[str, str]]:
+def panels(curves: Mapping[str, series.LearningCurves]) -> list[tuple[str, str]]:
     """The kind of curve and the x axis of each panel: that of the budget, and episodes."""
     both = (("evaluation", curves["evaluation"].budget), ("training", "episode"))
     return [(kind, by) for kind, by in both if curves[kind].by_axis[by]]
@@ -358,7 +335,7 @@ def draw_learning_curves(places: Sequence[Axes], one: EnvironmentSeries, marks: 
                 fill_band(axes, curve, marks[agent])
         for agent in filter(found.by_axis[by].__contains__, found.on_variant):
             # Circles mark the curve of a variant without colour.
-            curve, colour = found.by_axis[by][agent], COLOURS[marks[agent].colour]
+            curve, colour = found.by_axis[by][agent], series.COLOURS[marks[agent].colour]
             (circles,) = axes.plot(curve.x, curve.y, "o", ms=5, mfc="white", color=colour)
             circles.set_markevery(CIRCLES_APART)
         title = f"{environment.environment}: " if axes is places[0] else ""
@@ -370,7 +347,7 @@ def draw_learning_curves(places: Sequence[Axes], one: EnvironmentSeries, marks: 
         else:
             _draw_references(axes, environment)
         lettering(axes, title=title, x=_AXES[by], y=f"return{words}")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
     if on_variant:  # the legend's entry for the circles
         places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
     shared_legend(*places, n_bands=len(environment.agents))
@@ -393,10 +370,10 @@ def _set_scale(axes: Axes, linear_up_to: float | None) -> str:
     if linear_up_to is None:
         return ""
     axes.set_yscale("symlog", linthresh=linear_up_to)
-    axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(linear_up_to)))
-    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_locator(ticker.FixedLocator(symlog_ticks(linear_up_to)))
+    axes.yaxis.set_minor_locator(ticker.NullLocator())
     # With the minus sign of Matplotlib's own axes.
-    signed = FuncFormatter(lambda value, _: number(value).replace("-", "\N{MINUS SIGN}"))
+    signed = ticker.FuncFormatter(lambda value, _: number(value).replace("-", "\N{MINUS SIGN}"))
     axes.yaxis.set_major_formatter(signed)
     return f" (log scale beyond ±{number(linear_up_to)})"
 
@@ -419,7 +396,7 @@ def draw_runs(axes: Axes, one: EnvironmentSeries, study: StudySpec, marks: Marks
     environment, upwards = one.environment, one.environment.agents[::-1]
     means = [agent.metric.mean for agent in upwards]
     for row, (agent, mean) in enumerate(zip(upwards, means, strict=True)):
-        colour, values = COLOURS[marks[agent.agent].colour], environment.values[agent.agent]
+        colour, values = series.COLOURS[marks[agent.agent].colour], environment.values[agent.agent]
         n = len(values := values[np.isfinite(values)])
         spread = np.linspace(-0.18, 0.18, n) if n > 1 else np.zeros(n)
         axes.plot(values, row + spread, ".", color=colour, alpha=0.5, markersize=5)
@@ -456,14 +433,14 @@ def draw_sweeps(axes: Axes, one: EnvironmentSeries, metric: str) -> None:
     best = with_best_mean(environment, *(sweep.labels for sweep in sweeps.values()))
     rings: list[list[float]] = []
     for place, (group, sweep) in enumerate(sweeps.items()):
-        mark = Mark(group, place % N_KINDS, DASHES[place % len(DASHES)])
+        mark = Mark(group, place % series.N_KINDS, series.DASHES[place % len(series.DASHES)])
         x, y = sweep.means.x, sweep.means.y
         label = group if len(names) == 1 else f"{group}, {sweep.parameter}"
         axes.plot(x, y, marker="o", label=label, markersize=4, **line_style(mark))
         if place < MOST_BANDS:  # a bar each: a band needs two neighbours with an interval
             aside = 5 * (place - (min(len(sweeps), MOST_BANDS) - 1) / 2)
             at = offset_copy(axes.transData, _figure_of(axes), x=aside, units="points")
-            ends, colour = (sweep.means.low, sweep.means.high), COLOURS[mark.colour]
+            ends, colour = (sweep.means.low, sweep.means.high), series.COLOURS[mark.colour]
             axes.vlines(x, *ends, color=colour, alpha=0.35, linewidth=4, transform=at)
             axes.update_datalim(np.column_stack([np.tile(x, 2), np.concatenate(ends)]))
         rings += [at for *at, name in zip(x, y, sweep.labels, strict=True) if name in best]
@@ -475,9 +452,9 @@ def draw_sweeps(axes: Axes, one: EnvironmentSeries, metric: str) -> None:
         x, y = np.transpose(rings)
         axes.scatter(x, y, 90, "none", edgecolor="black", label=label, zorder=3)
     if len(values) <= MOST_TICKS:
-        axes.xaxis.set_major_locator(FixedLocator(_ticks_apart(axes, values)))
-        axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
+        axes.xaxis.set_major_locator(ticker.FixedLocator(_ticks_apart(axes, values)))
+        axes.xaxis.set_minor_locator(ticker.NullLocator())
+    axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:.4g}"))
     across = names[0] if len(names) == 1 else "value of the parameter"
     lettering(axes, title=environment.environment, x=across + words, y=METRIC_WORDS[metric])
     is_there = any(np.isfinite(sweep.means.low).any() for sweep in sweeps.values())
@@ -500,7 +477,7 @@ def _ticks_apart(axes: Axes, values: Floats) -> list[float]:
 def _set_scale_of_values(axes: Axes, values: Floats) -> str:
     """Make the x axis logarithmic if values span two decades; return words for its label."""
     least = float(values[values > 0].min(initial=np.inf))
-    if values.min() < 0 or values.max() < DWARFED * least:
+    if values.min() < 0 or values.max() < series.DWARFED * least:
         return ""
     if values.min() > 0:
         axes.set_xscale("log")
@@ -510,7 +487,7 @@ def _set_scale_of_values(axes: Axes, values: Floats) -> str:
 
 
 def draw_grid(
-    axes: Axes, grid: Grid, title: str, environment: EnvironmentAnalysis, metric: str
+    axes: Axes, grid: series.Grid, title: str, environment: EnvironmentAnalysis, metric: str
 ) -> None:
     """The means over two swept parameters as a heat map, the best in frames."""
     shares = grid.shares(is_cost=metric in COSTS)  # the lighter the better
@@ -524,7 +501,7 @@ def draw_grid(
             axes.text(column, row, number(mean), color=ink, ha="center", va="center", size=8)
         if grid.labels[row][column] in best:
             frame = Rectangle((column - 0.46, row - 0.44), 0.92, 0.88, fill=False, linewidth=2.5)
-            frame.set_edgecolor(COLOURS[1])
+            frame.set_edgecolor(series.COLOURS[1])
             axes.add_patch(frame)
     axes.invert_yaxis()
     axes.grid(visible=False)
@@ -546,30 +523,33 @@ def draw_grid(
 MOST_LINES = 14
 
 
-def write_figures(series: StudySeries) -> list[Path]:
+def write_figures(shown: StudySeries) -> list[Path]:
     """Draw all figures that a study's runs allow into its folder ``figures``; return the files."""
-    files = FigureFiles(series.analysis.results.root / "figures", series.analysis.study.figures)
+    analysis, marks = shown.analysis, shown.marks
+    files = FigureFiles(analysis.results.root / "figures", analysis.study.figures)
     files.folder.mkdir(exist_ok=True)
-    for one in series.environments:
+    for one in shown.environments:
         if one.pulls is not None:
-            _bandit_figures(files, one.pulls, one.environment.environment, series.marks)
-    for one in series.environments:
-        _study_figures(files, series, one)
-    if (overall := series.analysis.overall) is not None:
+            _bandit_figures(files, one.pulls, one.environment.environment, marks)
+    for one in shown.environments:
+        _study_figures(files, one, analysis.study, marks)
+    if (overall := analysis.overall) is not None:
         with files.figure("performance_profiles") as (axes,):
             for agent, shares in overall.profiles.items():
-                style = line_style(series.marks[agent])
+                style = line_style(marks[agent])
                 axes.plot(overall.thresholds, shares, label=agent, linewidth=1.5, **style)
             axes.set_ylim(0, 1.02)
-            axes.yaxis.set_major_formatter(PercentFormatter(1))
+            axes.yaxis.set_major_formatter(ticker.PercentFormatter(1))
             title = "Performance profiles over environments"
             lettering(axes, title=title, x="score", y="share of runs with a higher score")
             shared_legend(axes)
     return files.written
 
 
-def _study_figures(files: FigureFiles, series: StudySeries, one: EnvironmentSeries) -> None:
-    environment, metric, marks = one.environment, series.analysis.study.metric, series.marks
+def _study_figures(
+    files: FigureFiles, one: EnvironmentSeries, study: StudySpec, marks: Marks
+) -> None:
+    environment, metric = one.environment, study.metric
     name = file_name(environment.environment)
     if one.sweeps:
         with files.figure(f"{name}_sweep") as (axes,):
@@ -585,7 +565,7 @@ def _study_figures(files: FigureFiles, series: StudySeries, one: EnvironmentSeri
         with files.figure(f"{name}_learning_curves", n_columns) as places:
             draw_learning_curves(places, one, marks)
     with files.figure(f"{name}_intervals") as (axes,):
-        draw_runs(axes, one, series.analysis.study, marks)
+        draw_runs(axes, one, study, marks)
 
 
 def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Marks) -> None:

@@ -9,22 +9,21 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.results import StudyResults
 from rl_yardstick.experiments.study import file_name
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.environments import MISTAKES
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.files import replacing, write_json
-from rl_yardstick.pipeline.run import RECORD
-
-if TYPE_CHECKING:
-    from rl_yardstick.experiments.results import StudyResults
-    from rl_yardstick.pipeline.models import Which
+from rl_yardstick.pipeline.models import Which, load_agent, model_of_run
+from rl_yardstick.pipeline.playing import FrameTaker, play_episodes, playing_env
+from rl_yardstick.pipeline.run import RECORD, read_episodes
 
 FILM = "episode.gif"
 MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
@@ -94,9 +93,6 @@ def _loaded(planned: PlannedRun, which: Which = "final") -> Iterator[tuple[Any, 
     """An agent of a run, and an environment that draws pictures without a display."""
     import torch as th
 
-    from rl_yardstick.pipeline.models import load_agent, model_of_run
-    from rl_yardstick.pipeline.playing import playing_env
-
     import_modules(planned.spec.gym_packages)
     th.set_num_threads(planned.spec.n_threads)
     model = model_of_run(planned.run, which)
@@ -111,8 +107,6 @@ def _filmed(
     agent: Any, env: Any, max_steps: int, *, deterministic: bool
 ) -> tuple[list[Any], tuple[float, int] | None]:
     """The frames of an episode, and its return and length, None if it did not end."""
-    from rl_yardstick.pipeline.playing import FrameTaker, play_episodes
-
     taker, frames = FrameTaker(env), list[Any]()
     kept: Any = {"after_step": lambda done: frames.extend(taker.take(done))}
     played = play_episodes(agent, env, 1, max_steps, deterministic=deterministic, **kept)
@@ -151,7 +145,6 @@ def write_films(results: StudyResults) -> tuple[list[Path], list[str]]:
 
 def _films_of_training(planned: PlannedRun, folder: Path) -> Iterator[Path]:
     """A film for each checkpoint that was due, named by the number of the episode before it."""
-    from rl_yardstick.experiments.results import read_episodes
     from rl_yardstick.pipeline.evaluation.sampled import evaluation_seed
 
     name = f"{file_name(planned.agent)}_{file_name(planned.environment)}"

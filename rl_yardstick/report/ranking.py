@@ -122,7 +122,6 @@ def _success(row: Row) -> Cell | None:
 
 
 def _failed(row: Row) -> Cell | None:
-    """How many runs failed, and the interval of their share."""
     runs = row.agent.runs
     if runs.failed is None:
         return None

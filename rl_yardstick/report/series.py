@@ -16,10 +16,11 @@ from scipy import special
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.bandits import QUANTILES, PullStatistics
-from rl_yardstick.experiments.results import TRAINING_POINTS, StudyResults, read_episodes
+from rl_yardstick.experiments.results import TRAINING_POINTS, StudyResults
 from rl_yardstick.experiments.study import AgentSpec, StudySpec, symbol
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.run import read_episodes
 from rl_yardstick.verdicts import UNBOUNDED, Bounds, curve_band, on_grid, shared_grid
 
 # From this ratio on, the largest values flatten the rest of a linear axis: two decades.

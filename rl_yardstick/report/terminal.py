@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import pandas as pd
 from rich.console import Console
@@ -14,35 +13,11 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from rl_yardstick.experiments.off_policy import difference_in_value, mean_reward
+from rl_yardstick.experiments.off_policy import Comparison, difference_in_value, mean_reward
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.study import StudySpec
-from rl_yardstick.report.ranking import (
-    BANDIT_COLUMNS,
-    CAPTIONS,
-    COLUMNS,
-    Cell,
-    Column,
-    Row,
-    filled,
-    number_cell,
-)
-from rl_yardstick.report.words import (
-    answer,
-    conclusion,
-    enumeration,
-    interval,
-    number,
-    optimum_words,
-    pairs_both_ways,
-    seed_sentence,
-    seeds,
-    unseen_sentence,
-)
+from rl_yardstick.report import ranking, words
 from rl_yardstick.verdicts import FEW, Estimate
-
-if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
-    from rl_yardstick.experiments.off_policy import Comparison
 
 MOST_AGENT_WIDTH, LEAST_AGENT_WIDTH = 20, 12
 UNBOUNDED = 10_000  # columns
@@ -60,44 +35,44 @@ def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
     The pairs are a table of words for three agents or more, if it fits, and else sentences.
     """
     console.print()
-    for sentence in answer(analysis):
+    for sentence in words.answer(analysis):
         console.print(sentence, highlight=False)
     for environment in analysis.environments:
         console.print()
         _print_ranking(console, analysis, environment)
-        said, words = conclusion(analysis.study, environment), _words_of_pairs(environment)
-        as_table = len(environment.agents) > 2 and _width(console, words) <= console.width
-        for each in (said.lead, *((words,) if as_table else said.pairs), *said.notes):
+        said, pairs = words.conclusion(analysis.study, environment), _table_of_pairs(environment)
+        as_table = len(environment.agents) > 2 and _width(console, pairs) <= console.width
+        for each in (said.lead, *((pairs,) if as_table else said.pairs), *said.notes):
             console.print(each, highlight=False)
     console.print()
-    if unseen := unseen_sentence(analysis):
+    if unseen := words.unseen_sentence(analysis):
         console.print(unseen, highlight=False)
-    origin = seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
+    origin = words.seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
     console.print(origin, highlight=False)
 
 
-def _words_of_pairs(environment: EnvironmentAnalysis) -> Table:
+def _table_of_pairs(environment: EnvironmentAnalysis) -> Table:
     """The word on the agent of each row, against the agents below it in the ranking."""
     names = [agent.agent for agent in environment.agents]
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("", overflow="fold", max_width=MOST_AGENT_WIDTH)
     for name in names[1:]:
         table.add_column(f"vs {name}", overflow="fold", max_width=MOST_AGENT_WIDTH)
-    pairs = pairs_both_ways(environment.pairs)
+    pairs = words.pairs_both_ways(environment.pairs)
     for place, name in enumerate(names[:-1], start=1):
         found = [pairs.get((name, other)) for other in names[place:]]
-        words = ["" if pair is None else pair.text for pair in found]
-        table.add_row(name, *[""] * (place - 1), *words)
+        cells = ["" if pair is None else pair.text for pair in found]
+        table.add_row(name, *[""] * (place - 1), *cells)
     return table
 
 
 def _print_ranking(console: Console, analysis: StudyAnalysis, one: EnvironmentAnalysis) -> None:
     pulls, label = analysis.results.pulls, one.environment
     agents = one.agents
-    rows = [Row(agent, one, pulls.get((agent.agent, label))) for agent in agents]
+    rows = [ranking.Row(agent, one, pulls.get((agent.agent, label))) for agent in agents]
     on_bandit = [row for row in rows if row.pulls is not None]
     if on_bandit:
-        left_out = _print_fitting(console, label, BANDIT_COLUMNS, on_bandit)
+        left_out = _print_fitting(console, label, ranking.BANDIT_COLUMNS, on_bandit)
         runs = f"over {analysis.study.n_seeds} runs"
         explained = [f"regret: sum over the pulls of a run, with 95 % intervals {runs}"]
         if "simple regret" not in left_out:
@@ -107,23 +82,23 @@ def _print_ranking(console: Console, analysis: StudyAnalysis, one: EnvironmentAn
     else:
         title = label
         if one.optimum is not None:
-            title += f": optimum {optimum_words(one)}"
-            title += f", best random or constant policy {number(one.baseline)}"
-        columns = [column for column in COLUMNS if column.terminal]
+            title += f": optimum {words.optimum_words(one)}"
+            title += f", best random or constant policy {words.number(one.baseline)}"
+        columns = [column for column in ranking.COLUMNS if column.terminal]
         left_out = _print_fitting(console, title, columns, rows)
         explained = _caption(analysis.study, one, left_out)
     if left_out:
-        explained.append(f"a wider terminal shows {enumeration(left_out)} too")
+        explained.append(f"a wider terminal shows {words.enumeration(left_out)} too")
     # As wide as the terminal, and not as the table, which may be narrow.
     console.print("; ".join(explained), style="italic dim", highlight=False)
 
 
 def _print_fitting(
-    console: Console, title: str, columns: Sequence[Column], rows: Sequence[Row]
+    console: Console, title: str, columns: Sequence[ranking.Column], rows: Sequence[ranking.Row]
 ) -> list[str]:
     """Print a table with the columns that fit; return the headings of the others."""
     cells = {"agent": [row.agent.marked for row in rows]}
-    for column, found in filled(columns, rows):
+    for column, found in ranking.filled(columns, rows):
         cells[column.terminal] = _with_equal_decimals(found)
     order = (*FIRST_LEFT_OUT, *(column.terminal for column in columns[:0:-1]))
     table, left_out = _fitting(console, cells, order, MOST_AGENT_WIDTH)
@@ -135,17 +110,17 @@ def _print_fitting(
 _FIGURE = re.compile(r"-?[\d,]*(?:\.(\d+))?")
 
 
-def _with_equal_decimals(cells: Sequence[Cell]) -> list[str]:
+def _with_equal_decimals(cells: Sequence[ranking.Cell]) -> list[str]:
     """The texts of a column, in which all figures have as many decimals as the longest."""
     texts = [cell.in_line or cell.text for cell in cells]
     found = [_FIGURE.match(text) for text in texts]
     decimals = max(len(one[1] or "") for one in found if one)
-    fixed = partial(number, decimals=decimals)
+    fixed = partial(words.number, decimals=decimals)
     for place, (cell, one) in enumerate(zip(cells, found, strict=True)):
-        if one and one[0] == number(cell.value):
+        if one and one[0] == words.number(cell.value):
             was, now = one[0], fixed(cell.value)
-            if cell.estimate and interval(cell.estimate) in texts[place]:
-                was, now = interval(cell.estimate), interval(cell.estimate, fixed)
+            if cell.estimate and words.interval(cell.estimate) in texts[place]:
+                was, now = words.interval(cell.estimate), words.interval(cell.estimate, fixed)
             texts[place] = texts[place].replace(was, now, 1)
         elif one and one[0] == texts[place] and decimals:  # a score, which is rounded down
             texts[place] = f"{one[0].partition('.')[0]}.{one[1] or '':0<{decimals}}"
@@ -207,22 +182,22 @@ def folded(name: str, width: int, ends: Sequence[str] = (r"[\s/,]", "[_=-]")) ->
 
 
 def _caption(study: StudySpec, one: EnvironmentAnalysis, left_out: Sequence[str]) -> list[str]:
-    rows = [Row(agent, one) for agent in one.agents]
+    rows = [ranking.Row(agent, one) for agent in one.agents]
     on_variant = any(agent.changes for agent in one.agents)
-    words = {
-        "threshold": number(one.threshold),
-        "failed": number(one.failure_threshold),
+    figures = {
+        "threshold": words.number(one.threshold),
+        "failed": words.number(one.failure_threshold),
         "variants": " (*: on a variant of the environment)" if on_variant else "",
     }
-    over = seeds(*(one.seeds.values() or [study.n_seeds]))
+    over = words.seeds(*(one.seeds.values() or [study.n_seeds]))
     n_runs = [agent.n_runs for agent in one.agents]
     what = "the range of the runs" if max(n_runs, default=0) < FEW else "95 % intervals"
     told = [f"mean: {study.metric_words} over {over}, with {what}"]
     if any(agent.metric.mean.low == agent.metric.mean.high for agent in one.agents):
         told[0] += " (none where all runs are equal)"
-    shown = [column.terminal for column, _ in filled(COLUMNS, rows)]
-    known = [name for name in shown if name in CAPTIONS and name not in left_out]
-    return told + [f"{name}: {CAPTIONS[name].format(**words)}" for name in known]
+    shown = [column.terminal for column, _ in ranking.filled(ranking.COLUMNS, rows)]
+    known = [name for name in shown if name in ranking.CAPTIONS and name not in left_out]
+    return told + [f"{name}: {ranking.CAPTIONS[name].format(**figures)}" for name in known]
 
 
 def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:
@@ -230,7 +205,7 @@ def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> N
     for (environment, agent), rows in table.groupby(["environment", "agent"], sort=False):
         cells = {"episode": [f"{episode:,}" for episode in rows["episode"]]}
         for heading in ("average", "minimum", "maximum"):
-            cells[heading] = _with_equal_decimals([*map(number_cell, rows[heading])])
+            cells[heading] = _with_equal_decimals([*map(ranking.number_cell, rows[heading])])
         printed, _ = _fitting(console, cells, ())
         printed.title = f"{agent} on {environment}: return per {width} episodes, all seeds"
         console.print()
@@ -265,7 +240,7 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
         "mean reward a pull, ± half the 95 % interval; effective: effective sample size in pulls; "
         "differences below: simultaneous 95 % intervals"
     )
-    explained += f"; a wider terminal shows {enumeration(left_out)} too" if left_out else ""
+    explained += f"; a wider terminal shows {words.enumeration(left_out)} too" if left_out else ""
     console.print(explained, style="italic dim", highlight=False)
     for sentence in [*sentences(comparison), *comparison.notes]:
         console.print(f"  {sentence}")

@@ -14,16 +14,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rl_yardstick.experiments.analysis import MARK, ON_THE_SCALE, EnvironmentAnalysis, StudyAnalysis
-from rl_yardstick.experiments.plan import Seeds, TuningSeeds
-from rl_yardstick.experiments.study import COSTS, OF_TRAINING, StudySpec
+from rl_yardstick.experiments.plan import PlannedRun, Seeds, TuningSeeds
+from rl_yardstick.experiments.results import StudyResults, Tried
+from rl_yardstick.experiments.study import AS_IT_IS, COSTS, OF_TRAINING, SHIPPED, StudySpec
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.verdicts import Estimate, Pair, unseen_share
 
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.explanation import Explanation, StateLoss
-    from rl_yardstick.experiments.plan import PlannedRun
-    from rl_yardstick.experiments.results import StudyResults, Tried
 
 
 SIGNIFICANT = 4  # digits
@@ -582,8 +581,6 @@ def as_words(change: str) -> str:
 
 def tried_lines(tried: Sequence[Tried], optimum: float) -> list[str]:
     """The returns of each change by seed, and which change helps most; a hint and no verdict."""
-    from rl_yardstick.experiments.study import AS_IT_IS, SHIPPED
-
     width = max(len(one.change) for one in tried)
     told = []
     for one in tried:

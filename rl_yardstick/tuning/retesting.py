@@ -24,11 +24,12 @@ from optuna.trial import FrozenTrial, TrialState
 from rl_yardstick.envs.brackets import upper_is_proven
 from rl_yardstick.experiments.analysis import StudyAnalysis
 from rl_yardstick.experiments.study import METRICS, AgentSpec, Metric, StudySpec
+from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import plain, write_json, write_text
 from rl_yardstick.pipeline.settings import TUNED_ON, seeds_tuned_on
 from rl_yardstick.tuning.searching import ASKED, FAILURE, SETTINGS, Search, outcome_of, outcomes_of
-from rl_yardstick.tuning.tuning_spec import SHIPPED, STEPS, Floats, TuningSpec
+from rl_yardstick.tuning.tuning_spec import SHIPPED, STEPS, TuningSpec
 from rl_yardstick.verdicts import Estimate, Pair, Study, judge, mean_over_runs
 
 FOLDER, WINNER, RECORD = "retest", "winner.yml", "tuning.json"
@@ -121,7 +122,6 @@ def is_settled(said: Study) -> bool:
 
 
 def _against_shipped(said: Study) -> dict[str, Pair]:
-    """The other settings, compared with the shipped ones."""
     pairs = [one for pair in said.pairs for one in (pair, pair.swapped())]
     return {pair.first: pair for pair in pairs if pair.second == SHIPPED}
 

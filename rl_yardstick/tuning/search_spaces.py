@@ -390,16 +390,10 @@ _RANGE = ("low", "high", "scale", "forms", "final_share")
 
 
 def read_search_space(algo: str, env_id: str, path: Path | str | None = None) -> SearchSpace:
-    """Read the search space of an agent on an environment.
+    """Read the search space of an agent on an environment; ``path`` is another file than its own.
 
-    Args:
-        algo: the agent, whose file is ``hyperparams/search_spaces/<algo>.yml``.
-        env_id: the environment.
-        path: another file to read.
-
-    Raises:
-        UserError: if the file cannot be read, is not of this format, or has nothing to search.
-            Whether the agent takes its settings is for the agent to say, see `corners`.
+    Raises UserError if the file cannot be read, is not of this format, or has nothing to search.
+    Whether the agent takes its settings is for the agent to say, see `corners`.
     """
     path = HYPERPARAMS / "search_spaces" / f"{algo}.yml" if path is None else Path(path)
     if not path.is_file():

@@ -29,16 +29,11 @@ from optuna.trial import FrozenTrial, TrialState
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.experiments.plan import PlannedRun, plan
 from rl_yardstick.experiments.results import read_run
-from rl_yardstick.pipeline.errors import UserError, one_line, shown
+from rl_yardstick.pipeline.errors import UserError, as_user_error, shown
 from rl_yardstick.pipeline.files import plain
+from rl_yardstick.tuning import suggesting
 from rl_yardstick.tuning.search_spaces import read_search_space
-from rl_yardstick.tuning.suggesting import (
-    SeededSampler,
-    Suggestions,
-    name_of,
-    planned_runs,
-    shipped_entry,
-)
+from rl_yardstick.tuning.suggesting import planned_runs
 from rl_yardstick.tuning.tuning_spec import AUTO, STEPS, TuningSpec
 
 OWN_FILE = "trials.log"
@@ -67,11 +62,7 @@ class RunOutcome:
 
 
 def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
-    """Read the figure of a finished run, and its time.
-
-    Raises:
-        UserError: if the run has not finished, or has no such figure.
-    """
+    """Read a run's figure and its time; UserError if it has not finished, or has no such figure."""
     results = read_run(tuning.study, planned)
     if results is None:
         raise UserError("it has not finished")
@@ -190,7 +181,7 @@ class Search:
     tuning: TuningSpec
     root: Path  #: its folder
     study: Study  #: Optuna's study
-    suggestions: Suggestions  #: the settings of its trials
+    suggestions: suggesting.Suggestions  #: the settings of its trials
     #: called with the number of each trial that ends, its value (None if it was pruned or failed),
     #: and the reason of a failure
     tell: Callable[[int, float | None, str], None] = lambda *_: None
@@ -214,7 +205,7 @@ class Search:
     def n_at_optimum(self) -> int:
         """Number of settings that have the optimal score on all seeds of the search."""
         found = {
-            name_of(trial.user_attrs[SETTINGS])
+            suggesting.name_of(trial.user_attrs[SETTINGS])
             for trial in self.trials
             if (runs := outcomes_of(trial)).keys() == {*self.tuning.seeds}
             and all(run.steps is not None for run in runs.values())
@@ -322,8 +313,7 @@ class Search:
                 raise UserError(f"all of the first {MOST_FAILURES} trials failed; {reason}")
 
     def _end(self, each: _UnderWay, value: float | None, reason: str = "") -> None:
-        """End a trial; without a value if it was pruned or failed."""
-        state = TrialState.PRUNED if value is None else TrialState.COMPLETE
+        state = TrialState.PRUNED if value is None else TrialState.COMPLETE  # or it has failed
         self.study.tell(each.trial, value, state)
         each.is_over = True
         self._trials.remove(each)
@@ -336,15 +326,14 @@ class Search:
 def open_search(tuning: TuningSpec, root: Path) -> Search:
     """Check a search, and open or create its trials in its folder, which this process has locked.
 
-    Raises:
-        UserError: if the search cannot be done, or the folder has another one.
+    Raises UserError if the search cannot be done, or the folder has another one.
     """
     run, agent = plan(replace(tuning.study, n_seeds=1), root)[0], tuning.agent
     if tuning.figure == AUTO:
         is_bandit = ALGORITHMS[agent.algo].for_bandits
         tuning = replace(tuning, figure="regret" if is_bandit else "score")
     space = read_search_space(agent.algo, tuning.environment.env_id, tuning.search_space)
-    suggestions = Suggestions(tuning, space, shipped_entry(run.spec))
+    suggestions = suggesting.Suggestions(tuning, space, suggesting.shipped_entry(run.spec))
     if not suggestions.n_free:
         raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
     suggestions.check(root)
@@ -352,7 +341,7 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
     study = optuna.create_study(
         study_name=tuning.study.name,
         storage=open_storage(root),
-        sampler=SeededSampler(tuning),
+        sampler=suggesting.SeededSampler(tuning),
         pruner=optuna.pruners.NopPruner(),  # `is_hopeless` decides
         direction="minimize" if tuning.is_cost else "maximize",
         load_if_exists=True,
@@ -376,8 +365,7 @@ def open_search(tuning: TuningSpec, root: Path) -> Search:
 def open_storage(root: Path) -> BaseStorage:
     """Open the journal of the trials in the search's folder, which this process has locked.
 
-    Raises:
-        UserError: if the file is damaged, or holds a study of another program.
+    Raises UserError if the file is damaged, or holds a study of another program.
     """
     path = root / OWN_FILE
     if path.exists():
@@ -386,11 +374,9 @@ def open_storage(root: Path) -> BaseStorage:
             os.truncate(path, len(content) + whole)
     for lock in root.glob(f"{OWN_FILE}.lock*"):
         lock.unlink()  # of a process that was killed
-    try:
+    with as_user_error(f"{path} is damaged", ValueError, LookupError, TypeError, AssertionError):
         storage = JournalStorage(JournalFileBackend(str(path), JournalFileOpenLock(str(path))))
         studies = storage.get_all_studies()
-    except (ValueError, LookupError, TypeError, AssertionError) as error:
-        raise UserError(f"{path} is damaged: {one_line(error)}") from error
     for study in studies:
         if ASKED not in study.user_attrs and storage.get_n_trials(study._study_id):
             other = f"holds the Optuna study {study.study_name} of another program"

@@ -123,11 +123,7 @@ class Suggestions:
         return entry
 
     def check(self, root: Path) -> None:
-        """Check that the agent takes all ends and words of the space.
-
-        Raises:
-            UserError: with the file of the space, and what is wrong there.
-        """
+        """Raise UserError if the agent refuses an end or a word of the space."""
         for settings in corners(self.space):
             planned_runs(self.tuning, root, self.merged(settings))
 

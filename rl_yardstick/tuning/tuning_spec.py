@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.experiments.study import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import plain
 
-Floats = NDArray[np.float64]
 SAMPLERS, PRUNERS, OBJECTIVES = ("tpe", "random"), ("auto", "none"), ("mean", "iqm", "lower")
 STEPS = "steps"  # of training until the learning curve reaches the threshold
 FIGURES = ("score", *METRICS, STEPS)  # of a run

@@ -31,8 +31,7 @@ from rl_yardstick.pipeline.spec import TrainSpec
 class Player:
     """An agent in environments: it is told action masks, and sees finite observations only.
 
-    Raises:
-        UserError: if it takes masks, and the environments have none.
+    Raises UserError if it takes masks, and the environments have none.
     """
 
     def __init__(self, model: BaseAlgorithm, env: VecEnv, when: str) -> None:

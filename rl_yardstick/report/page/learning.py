@@ -155,10 +155,13 @@ def write_learning_page(spec: TrainSpec, recorder: Watch, path: Path, title: str
     The default title names the agent and the environment.
     """
     place = place_data(spec, recorder)
-    heading = {"title": title or f"{spec.algo} on {spec.place}", "seed": spec.seed}
+    page = frame.templates("learning").get_template("learning.html")
+    scripts = [f"learning/learning_{name}.js" for name in SCRIPTS]
+    around = frame.page_frame(scripts, ("page.css", "learning/learning.css"), is_plotted=False)
+    around |= {"title": title or f"{spec.algo} on {spec.place}", "seed": str(spec.seed)}
     for data in _ever_less(recorder):
-        words = page_words(spec, data)
-        text = _render({**heading, **words}, {**data, **place})
+        words, packed = page_words(spec, data), frame.packed(frame.as_json(data | place, exactly))
+        text = page.render(**around, **words, data=packed)
         if len(text.encode()) <= MOST_BYTES:
             break
     write_text(path, text)
@@ -179,16 +182,6 @@ def _ever_less(recorder: Watch) -> Iterator[dict[str, Any]]:
         n_steps = n_steps * 3 // 4
 
 
-def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
-    data_text = frame.packed(frame.as_json(data, exactly))
-    scripts = [f"learning/learning_{name}.js" for name in SCRIPTS]
-    styles = ("page.css", "learning/learning.css")
-    template = frame.templates("learning").get_template("learning.html")
-    return template.render(
-        **words, data=data_text, **frame.page_frame(scripts, styles, is_plotted=False)
-    )
-
-
 # The first training of each agent of a study, repeated to be recorded.
 
 BATCH = "its runs were done as one batch, which saves no agent"
@@ -197,20 +190,15 @@ BATCH = "its runs were done as one batch, which saves no agent"
 def write_first_pages(analysis: StudyAnalysis, n_workers: int, stop: Stop) -> list[LearningPage]:
     """Write a page for the first run of each agent, into ``learning``; newer pages stay.
 
-    Args:
-        analysis: the study.
-        n_workers: how many trainings are repeated at once, each in a process of its own.
-        stop: ends them after a signal.
-
-    Returns:
-        For each agent on each environment its page, or the reason why there is none.
+    Repeats up to ``n_workers`` trainings at once, each in a process of its own, and ends them after
+    a signal. Returns for each agent on each environment its page, or why there is none.
     """
     root, timeout = analysis.results.root, analysis.study.run_timeout
-    pages = {run.labels: _page_of(root, run) for runs in first_runs(analysis) for run in runs}
-    runs = [run for group in first_runs(analysis) for run in group if pages[run.labels] is None]
-    pool = process_pool(n_workers)
+    runs = [run for of_place in first_runs(analysis) for run in of_place]
+    pages = {run.labels: _page_of(root, run) for run in runs}
+    to_do, pool = [run for run in runs if pages[run.labels] is None], process_pool(n_workers)
     try:
-        again = {pool.submit(_train_again, timeout, root, run): run for run in runs}
+        again = {pool.submit(_train_again, timeout, root, run): run for run in to_do}
         while wait(again, timeout=0.2).not_done:
             stop.check()
     finally:

@@ -156,7 +156,6 @@ def curves(report: Report) -> Section | None:
 
 
 def _at(curve: Curve, share: float) -> dict[str, float]:
-    """The point of a curve nearest to this share of its range of x."""
     nearest = np.abs(curve.x - share * curve.x[-1]).argmin()
     return {name: values[nearest] for name, values in vars(curve).items()}
 
