@@ -11,6 +11,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.special import softmax
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -184,11 +185,6 @@ def shares(model, mask, n=20_000):
     masks = np.tile(np.array(mask, bool), (n, 1))
     arms = model.predict(np.zeros(n, int), deterministic=False, action_masks=masks)[0]
     return np.bincount(arms, minlength=A) / n
-
-
-def softmax(values):
-    weights = np.exp(np.array(values) - max(values))
-    return weights / weights.sum()
 
 
 def test_bounds_count_all_pulls_of_the_context():

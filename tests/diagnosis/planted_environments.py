@@ -52,9 +52,8 @@ class Swallowing(gym.Wrapper):
 def corridor(n_open):
     """A model of five places in a row, of which only the first ones can be reached."""
     ahead = [min(s + 1, n_open - 1 if s < n_open else 4) for s in range(5)]
-    return {
-        s: {a: [(1.0, t, float(t == 4), t == 4)] for a in range(3)} for s, t in enumerate(ahead)
-    }
+    rows = [[(1.0, t, float(t == 4), t == 4)] for t in ahead]
+    return {s: dict.fromkeys(range(3), row) for s, row in enumerate(rows)}
 
 
 LOG = []
