@@ -3,7 +3,6 @@
 import json
 import re
 import signal
-import sys
 
 import gymnasium as gym
 import pytest
@@ -128,13 +127,10 @@ class Plain:
         (["elsewhere:Lake"], 2, "elsewhere: no module named elsewhere"),
     ],
 )
-def test_what_is_typed(typed, monkeypatch, tmp_path, words, code, line):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "odd.py").write_text(ODD)
+def test_what_is_typed(typed, own_folder, monkeypatch, words, code, line):
+    (own_folder / "odd.py").write_text(ODD)
     alarm = signal.alarm
-    monkeypatch.setattr(signal, "alarm", lambda seconds: alarm(min(seconds, 2)))
+    monkeypatch.setattr(signal, "alarm", lambda seconds: alarm(min(seconds, 5)))
     found, out, err = typed("yardstick", "check-env", *words)
     assert (found, "Traceback" in err) == (code, False)
     assert line in " ".join((out + err).split())
-    gym.registry.pop(words[0].partition(":")[2], None)
-    sys.modules.pop("odd", None)
