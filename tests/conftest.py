@@ -107,14 +107,8 @@ def small_study():
         EnvironmentSpec(name, name, {"n_timesteps": 2000})
         for name in ("FrozenLake-v1", "Warehouse-v0")
     )
-    return StudySpec(
-        name="small",
-        title="Small & <b>bold</b>",
-        description="What an <i>agent</i> does.",
-        agents=agents,
-        environments=environments,
-        n_seeds=2,
-    )
+    title, words = "Small & <b>bold</b>", "What an <i>agent</i> does."
+    return StudySpec("small", title, agents, environments, n_seeds=2, description=words)
 
 
 @pytest.fixture
@@ -139,11 +133,23 @@ def own_folder(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def typed(capfd):
-    """Run a command line in this process: exit code, output, errors, its children's included."""
-    from rl_yardstick.commands import main, run_command
+def states_at_each_moment(monkeypatch):
+    """A training saves its state at each moment at which that is safe."""
+    from rl_yardstick.pipeline.callbacks import StateCallback
 
-    def run(*words):
+    monkeypatch.setattr(StateCallback, "share_of_time", 1e9)
+    monkeypatch.setattr(StateCallback, "shortest_pause", 0.0)
+
+
+class Typed:
+    """Runs command lines in this process: exit code, output, errors, its children's included."""
+
+    def __init__(self, capfd):
+        self.capfd = capfd
+
+    def __call__(self, *words):
+        from rl_yardstick.commands import main, run_command
+
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
         name = Path(words[0]).name
         command = main if name == "yardstick" else partial(run_command, name.removesuffix(".py"))
@@ -154,27 +160,35 @@ def typed(capfd):
                 command()
         for number, handler in handlers.items():  # the process would end with its command
             signal.signal(number, handler)
-        captured = capfd.readouterr()
+        captured = self.capfd.readouterr()
         return stop.value.code, captured.out, captured.err
 
-    return run
+    def done(self, *words):
+        """The output of a command that succeeds without a word on errors."""
+        code, out, err = self(*words)
+        assert (code, err) == (0, ""), f"{words}\n{out}{err}"
+        return out
+
+    def refused(self, *words):
+        """The one line that a mistake ends with."""
+        code, out, err = self(*words)
+        assert (code, err.count("\n")) == (2, 1), f"{words}\n{out}{err}"
+        return err
 
 
 @pytest.fixture
-def type_in_own_folder(own_folder, typed):
-    """As `typed`, inside a user's folder."""
-    return typed
+def typed(capfd):
+    return Typed(capfd)
 
 
 @pytest.fixture
 def quick_runs(monkeypatch):
     """Runs without pictures and with few evaluated steps, which take most of a short run."""
     monkeypatch.setattr("rl_yardstick.pipeline.training.draw", lambda *_: None)
-    place = "rl_yardstick.pipeline.evaluation.sampled.STEPS_IN_ANY_CASE"
-    monkeypatch.setattr(place, 200)
+    monkeypatch.setattr("rl_yardstick.pipeline.evaluation.sampled.STEPS_IN_ANY_CASE", 200)
 
 
-def call(function, *args):
+def do_here(function, *args):
     return function(*args)
 
 
@@ -198,8 +212,7 @@ def in_this_process(monkeypatch):
     """Studies whose runs are done by this process."""
     for place in ("experiments.pool", "report.page.learning"):
         monkeypatch.setattr(f"rl_yardstick.{place}.process_pool", Here)
-    place = "rl_yardstick.report.page.world_sections.do_aside"
-    monkeypatch.setattr(place, lambda function, *args: function(*args))
+    monkeypatch.setattr("rl_yardstick.report.page.world_sections.do_aside", do_here)
 
 
 @pytest.fixture(scope="session")
@@ -242,7 +255,7 @@ def report_study(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(films, "MAX_STEPS", 20)  # longer films take ten seconds to draw
         # In this process, where that holds, also if there is one that runs are forked from.
-        patch.setattr(world_sections, "do_aside", call)
+        patch.setattr(world_sections, "do_aside", do_here)
         write_report(Report(study_series(analysis), "python compare.py 'a & b.yml'"), page)
     return SimpleNamespace(
         study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page

@@ -1,5 +1,6 @@
 """The documents: their commands are accepted as they stand, and do what the page says of them."""
 
+import importlib
 import re
 import shlex
 import sys
@@ -10,17 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rl_yardstick.commands import (
-    audit,
-    check_env,
-    compare,
-    enjoy,
-    explain,
-    rate,
-    shaping,
-    train,
-    tune,
-)
 from rl_yardstick.commands.compare import study_spec
 from rl_yardstick.commands.train import spec_from_flags
 from rl_yardstick.commands.tune import tuning_spec
@@ -36,20 +26,16 @@ from recommended_commands import reached, trainings, with_outcomes  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 COMPARE = (ROOT / "docs" / "compare.md").read_text()
-MODULE_COMMANDS = "explain|rate|shaping|audit|check-env"
-COMMAND = re.compile(
-    rf"python ((?:(?:train|enjoy|compare|tune)\.py|-m rl_yardstick (?:{MODULE_COMMANDS}))"
-    r" [^`\n)#]*)"
-)
+SCRIPTS = ("train.py", "enjoy.py", "compare.py", "tune.py")
+OTHERS = ("explain", "rate", "shaping", "audit", "check-env")
+FIRST = "|".join([*map(re.escape, SCRIPTS), *(f"-m rl_yardstick {name}" for name in OTHERS)])
+COMMAND = re.compile(rf"python ((?:{FIRST}) [^`\n)#]*)")
 # Each with the first document that it stands in.
 FOUND_IN = {
     command.strip(): document.name
     for document in reversed([ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))])
     for command in COMMAND.findall(document.read_text().replace("--env\nWare", "--env Ware"))
 }
-MODULES = {"train.py": train, "enjoy.py": enjoy, "compare.py": compare, "tune.py": tune}
-MODULES |= {"explain": explain, "rate": rate, "shaping": shaping, "audit": audit}
-MODULES["check-env"] = check_env
 COMMANDS = [pytest.param(each, id=f"{name}: {each}") for each, name in FOUND_IN.items()]
 
 
@@ -61,7 +47,9 @@ def test_commands_can_be_carried_out(tmp_path, monkeypatch, command):
     log = "segment,arm,reward,propensity\ncore,0,1,0.5\ncasual,1,0,0.5\n"
     (tmp_path / "train.csv").write_text(log)
     monkeypatch.chdir(ROOT if script == "compare.py" else tmp_path)
-    args = MODULES[script].build_parser().parse_args(words)
+    name = script.removesuffix(".py").replace("-", "_")
+    module = importlib.import_module(f"rl_yardstick.commands.{name}")
+    args = module.build_parser().parse_args(words)
     if script == "train.py":
         args.trained_agent = ""
         assert args.list or spec_from_flags(args).env_id == args.env
@@ -80,7 +68,7 @@ def test_commands_can_be_carried_out(tmp_path, monkeypatch, command):
 def test_there_are_commands_to_check():
     counts = Counter(command.removeprefix("-m rl_yardstick ").split()[0] for command in FOUND_IN)
     assert counts["compare.py"] >= 20
-    assert all(counts[script] for script in MODULES)
+    assert all(counts[script] for script in (*SCRIPTS, *OTHERS))
     assert len(SAMPLE) > 10
 
 

@@ -19,7 +19,7 @@ COMMANDS = re.findall(r"^python ~/yardstick/(.*)$", DOCUMENT, re.M)
 
 
 @pytest.mark.usefixtures("in_this_process", "quick_runs")
-def test_the_document_can_be_followed(type_in_own_folder, own_folder, monkeypatch):
+def test_the_document_can_be_followed(typed, own_folder, monkeypatch):
     monkeypatch.setattr("rl_yardstick.pipeline.evaluation.sampled.STEPS_AT_FIRST", 200)
     for name, text in FILES:
         (own_folder / name).write_text(text)
@@ -28,8 +28,7 @@ def test_the_document_can_be_followed(type_in_own_folder, own_folder, monkeypatc
     for command in COMMANDS:
         # The comparison with PPO takes a minute as it stands.
         short = command.replace("-n 100000 --seeds 10", "-n 1000 --seeds 2 --no-report")
-        code, out, err = type_in_own_folder(*shlex.split(short))
-        assert (code, err) == (0, ""), f"{command}\n{out}{err}"
+        out = typed.done(*shlex.split(short))
         if "--algo cautious" in command:  # as the page says of it; its state can be kept
             assert "   return -15 of -13 (gap 2)   success 100 %" in out
             assert "no state can be kept" not in out
@@ -57,22 +56,19 @@ def test_a_model_can_be_checked_as_written(own_folder, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("the environment's P is not what step does: state ")
 
 
-def test_a_rule_is_one_file(own_folder, type_in_own_folder):
-    (rule,) = re.findall(
-        r'```python\n("""Cautious Q-learning\."""\n.*?)```', CONTRIBUTING, re.DOTALL
-    )
+def test_a_rule_is_one_file(own_folder, typed):
+    form = r'```python\n("""Cautious Q-learning\."""\n.*?)```'
+    (rule,) = re.findall(form, CONTRIBUTING, re.DOTALL)
     entry = '"cautious", "cautious:CautiousQLearning", observations="Discrete", actions="Discrete"'
     text = f"{rule}\n\nfrom rl_yardstick import agents\n\nagents.register({entry})\n"
     (own_folder / "cautious.py").write_text(text)
     words = ["--env", "FrozenLake-v1", "--algo", "cautious", "-n", "300", "-params", "caution:0.3"]
     command = ["train.py", "--gym-packages", "cautious", "--seed", "0", *words]
-    assert type_in_own_folder(*command)[::2] == (0, "")
+    assert typed(*command)[::2] == (0, "")
     (path,) = Path("logs").glob("*/*/run.json")
     record = json.loads(path.read_text())
     assert record["final"]["exact"]
     assert record["engine"] == "compiled"
     assert record["spec"]["algorithm"]["caution"] == 0.3
     # A wrong value of its setting is refused in a line.
-    code, _, err = type_in_own_folder(*command[:-1], "caution:2")
-    assert (code, err.count("\n")) == (2, 1)
-    assert "caution" in err
+    assert "caution" in typed.refused(*command[:-1], "caution:2")

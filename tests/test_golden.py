@@ -14,9 +14,8 @@ PLACES = ("anywhere", "here")
 
 
 def test_a_sample_is_as_it_was_recorded():
-    done = subprocess.run(
-        [sys.executable, GOLDEN, "--only", *SAMPLE], capture_output=True, text=True, check=False
-    )
+    words = [sys.executable, GOLDEN, "--only", *SAMPLE]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
     assert int(done.stdout.split()[0]) == 6, "most of the sample is not there any more"
 

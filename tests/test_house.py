@@ -56,21 +56,14 @@ def test_every_imported_library_is_a_declared_dependency() -> None:
     # Gymnasium's extras bring it, in the version that Gymnasium wants.
     declared.add(canonicalize_name("pygame-ce"))
     providers = importlib.metadata.packages_distributions()
+    known = {HOUSE.name, *(command.stem for command in ROOT.glob("*.py")), *sys.stdlib_module_names}
     undeclared = {
         f"{path.relative_to(ROOT)}: {name}"
         for path in sources()
-        for name in imported_libraries(path)
+        for name in imported_names(path) - known
         if declared.isdisjoint(canonicalize_name(provider) for provider in providers.get(name, []))
     }
     assert undeclared == set()
-
-
-def imported_libraries(path: Path) -> Iterator[str]:
-    """Top-level names of the third-party modules that a file imports, anywhere in it."""
-    own = {HOUSE.name, *(command.stem for command in ROOT.glob("*.py"))}
-    for name in imported_names(path):
-        if name not in own and name not in sys.stdlib_module_names:
-            yield name
 
 
 def imported_names(path: Path) -> set[str]:
@@ -152,11 +145,6 @@ def published_files() -> Iterator[Path]:
 
 def test_all_that_is_compiled_stands_where_the_digest_of_machine_code_looks() -> None:
     """Compiled functions, and what is compiled into them, are sources of `mdp` and `agents`."""
-    compiling = {
-        path.relative_to(HOUSE).parts[0]
-        for path in HOUSE.rglob("*.py")
-        if re.search(
-            r"^\s*(import numba|from numba)|^@?(inlined|kernel|compiled)$", path.read_text(), re.M
-        )
-    }
-    assert compiling == set(COMPILED)
+    form = re.compile(r"^\s*(import numba|from numba)|^@?(inlined|kernel|compiled)$", re.M)
+    compiling = [path for path in HOUSE.rglob("*.py") if form.search(path.read_text())]
+    assert {path.relative_to(HOUSE).parts[0] for path in compiling} == set(COMPILED)

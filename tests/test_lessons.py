@@ -282,16 +282,11 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(
-    ("check", "answer", "said"),
-    [
-        pytest.param(check, answer, said, id=f"{number} {place}: {said}")
-        for number, (check, rows) in enumerate(CASES.items())
-        for place, (answer, said) in enumerate(rows)
-    ],
-)
-def test_what_is_said_of_an_answer(check, answer, said):
-    assert check(answer).startswith(said)
+@pytest.mark.parametrize("place", range(len(CASES)))
+def test_what_is_said_of_each_answer(place):
+    check, rows = [*CASES.items()][place]
+    for answer, said in rows:
+        assert check(answer).startswith(said), said
 
 
 @hypothesis.given(st.integers(0, 2**32 - 1), st.floats(0, 0.99))

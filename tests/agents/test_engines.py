@@ -69,9 +69,8 @@ ROWS = {  # each agent as the contract has it, in one of the worlds; and wrapper
 
 def in_world(name, place, n_envs=1, folder=None, **settings):
     env_id, kwargs = place
-    return trainings.make(
-        name, trainings.environment(env_id, n_envs, folder=folder, **kwargs), **settings
-    )
+    env = trainings.environment(env_id, n_envs, folder=folder, **kwargs)
+    return trainings.make(name, env, **settings)
 
 
 def assert_engines_agree(make_model, train):

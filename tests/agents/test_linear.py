@@ -8,6 +8,7 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import softmax
 
 from rl_yardstick.agents.linear.algorithm import make_tiles, tiles_of_all
 from tests.agents.hand_fed import Told
@@ -108,11 +109,6 @@ def test_semi_gradient_sarsa_judges_by_the_action_that_it_commits_to():
     assert chosen == {0, 1}
 
 
-def softmax(preferences):
-    weights = np.exp(preferences - preferences.max(axis=-1, keepdims=True))
-    return weights / weights.sum(axis=-1, keepdims=True)
-
-
 @pytest.mark.parametrize("baseline", ["none", "value"])
 def test_the_mean_update_of_all_episodes_is_the_exact_gradient(baseline):
     """Episodes lead through three layers of two states: returns times scores of all that was done.
@@ -124,7 +120,8 @@ def test_the_mean_update_of_all_episodes_is_the_exact_gradient(baseline):
     rewards, preferences, state_values = (rng.normal(size=shape) for shape in ((6, 2), (6, 2), 6))
     settings = {"learning_rate": 0.25, "baseline": baseline}
     told = Told("reinforce", spaces.Discrete(7), gamma=discount, **settings)
-    mean, gradient, total, policy = np.zeros((6, 2)), np.zeros((6, 2)), 0.0, softmax(preferences)
+    mean, gradient, total = np.zeros((6, 2)), np.zeros((6, 2)), 0.0
+    policy = softmax(preferences, axis=1)
     weights, values = told.agent.policy.weights.numpy(), told.agent.policy.state_weights.numpy()
     for sides in itertools.product((0, 1), repeat=3):
         for actions in itertools.product((0, 1), repeat=3):
@@ -135,9 +132,8 @@ def test_the_mean_update_of_all_episodes_is_the_exact_gradient(baseline):
                 following = 6 if is_last else 2 * t + 2 + sides[t + 1]
                 end, reward = "terminated" * is_last, rewards[state, action]
                 told.step(state, action, reward, following, end)
-                prob *= policy[state, action] * (
-                    1 if is_last else onward[state, action, sides[t + 1]]
-                )
+                chance = 1 if is_last else onward[state, action, sides[t + 1]]
+                prob *= policy[state, action] * chance
                 earned += discount**t * reward
                 scores[state] = np.eye(2)[action] - policy[state]
             mean += prob * (weights[:6] - preferences)

@@ -11,12 +11,14 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.special import softmax
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from rl_yardstick.agents.bandits.algorithm import Pull
 from rl_yardstick.agents.library import DQN, DoubleDQN
+from rl_yardstick.envs import found_models
 from rl_yardstick.envs.known_models import action_masks_of_states
 from rl_yardstick.envs.wrappers import ActionMasks
 from tests.agents.hand_fed import feed
@@ -54,6 +56,14 @@ class Shop(gym.Env):
         reward = float(self.np_random.random() < 0.2 * (1 + action))
         is_due = self.day % self.batch == 0
         return self.context, reward, False, self.day == self.limit, {"feedback_due": is_due}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def masks_are_met_and_not_searched_for():
+    """To find the model of each shop takes longer than to learn in it."""
+    found_models.limit("none")
+    yield
+    found_models.limit("auto")
 
 
 def in_shop(name, masks=BY_CONTEXT, n_envs=1, **kwargs):
@@ -184,11 +194,6 @@ def shares(model, mask, n=20_000):
     masks = np.tile(np.array(mask, bool), (n, 1))
     arms = model.predict(np.zeros(n, int), deterministic=False, action_masks=masks)[0]
     return np.bincount(arms, minlength=A) / n
-
-
-def softmax(values):
-    weights = np.exp(np.array(values) - max(values))
-    return weights / weights.sum()
 
 
 def test_bounds_count_all_pulls_of_the_context():

@@ -60,6 +60,7 @@ def generator(draws):
 
 
 NO_LOW = np.array([[-np.inf, 0.1], [-2, -np.inf]], np.float32)
+NESTED = spaces.Tuple([spaces.MultiBinary(3)])
 BOX = drawn_from(spaces.Box, NO_LOW, np.full((2, 2), 3, np.float32))
 SAMPLES = {
     "dictionary": {"b": 1, "a": 2, (True, ("x", 3)): None},
@@ -79,9 +80,7 @@ SAMPLES = {
     "box": BOX,
     "bytes": drawn_from(spaces.Box, 0, 255, (2, 1), np.uint8),
     "tuple of spaces": drawn_from(spaces.Tuple, [spaces.Discrete(2), BOX]),
-    "spaces by name": drawn_from(
-        spaces.Dict, [("b", spaces.Discrete(9)), ("a", spaces.Tuple([spaces.MultiBinary(3)]))]
-    ),
+    "spaces by name": drawn_from(spaces.Dict, [("b", spaces.Discrete(9)), ("a", NESTED)]),
 }
 
 

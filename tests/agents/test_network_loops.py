@@ -154,10 +154,8 @@ class RolloutDiary(Diary):
 def make(case, engine="compiled"):
     name, env, n_envs, _, settings = CASES[case]
     settings = {"policy_kwargs": {"net_arch": [16]}, **settings}
-    env, rate = (
-        settings.pop("wrap", lambda env: env)(make_vec_env(env, n_envs, seed=3)),
-        LinearSchedule(1e-2, 1e-3, 0.8),
-    )
+    env = settings.pop("wrap", lambda env: env)(make_vec_env(env, n_envs, seed=3))
+    rate = LinearSchedule(1e-2, 1e-3, 0.8)
     algorithm = load_algorithm(name)
     return algorithm("MlpPolicy", env, seed=5, engine=engine, learning_rate=rate, **settings)
 

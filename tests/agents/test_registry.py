@@ -118,9 +118,8 @@ def test_a_name_is_registered_once(name):
     agents.register("taken", "some_module:Mine")
     before = dict(ALGORITHMS)
     agents.register("taken", "some_module:Mine")  # the same class again
-    with pytest.raises(
-        ValueError, match=f"there is an agent {name} already: give other:Mine another"
-    ):
+    line = f"there is an agent {name} already: give other:Mine another"
+    with pytest.raises(ValueError, match=line):
         agents.register(name, "other:Mine")
     assert before == ALGORITHMS
 

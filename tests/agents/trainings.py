@@ -104,10 +104,8 @@ class Unknown(gym.Env):
 
 def environment(env_id, n_envs=1, seed=3, wrapper=None, folder=None, **env_kwargs):
     """Environments under Monitor, which writes into the folder."""
-    folder = None if folder is None else str(folder)
-    return make_vec_env(
-        env_id, n_envs, seed, env_kwargs=env_kwargs, wrapper_class=wrapper, monitor_dir=folder
-    )
+    more = {"wrapper_class": wrapper, "monitor_dir": folder and str(folder)}
+    return make_vec_env(env_id, n_envs, seed, env_kwargs=env_kwargs, **more)
 
 
 def make(name, env, **settings):

@@ -10,6 +10,11 @@ def seeds_are_drawn_alike(request, monkeypatch):
     monkeypatch.setattr("secrets.randbelow", drawing.randrange)
 
 
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture
 def pictures():
     """For tests that look at what a run draws."""
@@ -19,10 +24,3 @@ def pictures():
 def no_pictures_elsewhere(request):
     if "pictures" not in request.fixturenames:
         request.getfixturevalue("quick_runs")
-
-
-@pytest.fixture
-def type_command(monkeypatch, typed, tmp_path):
-    """As `typed`, inside an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return typed

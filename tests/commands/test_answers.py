@@ -17,10 +17,9 @@ ROOT = Path(__file__).parents[2]
 LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 
 
-def test_training_by_the_installed_name(type_command, tmp_path):
+def test_training_by_the_installed_name(typed, tmp_path):
     words = [*LAKE, "--seed", "0", "-n", "500"]
-    code, out, err = type_command("/venv/bin/yardstick", "train", *words)
-    assert (code, err) == (0, "")
+    out = typed.done("/venv/bin/yardstick", "train", *words)
     assert "watch    yardstick enjoy logs/qlearning/FrozenLake-v1_1\n" in out
     assert "explain  yardstick explain logs/qlearning/FrozenLake-v1_1\n" in out
     assert "compare  yardstick compare --env FrozenLake-v1 --algos qlearning sarsa" in out
@@ -29,8 +28,8 @@ def test_training_by_the_installed_name(type_command, tmp_path):
     assert written == f"yardstick train {shlex.join(words)}\n"
 
 
-def test_its_version(type_command):
-    assert type_command("yardstick", "--version") == (0, f"{version('rl-yardstick')}\n", "")
+def test_its_version(typed):
+    assert typed("yardstick", "--version") == (0, f"{version('rl-yardstick')}\n", "")
 
 
 QUICKLY = ("train --help", "train --list", "compare --help", "enjoy --algo ppo --env CartPole-v1")
@@ -71,18 +70,18 @@ def runs(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(
-    ("line", "said"), [*((line, "") for line in TABLE["commands"]), *TABLE["said"].items()]
-)
-def test_mistakes_are_one_line(line, said, type_command, tmp_path, request):
+MISTAKES = [*((line, "") for line in TABLE["commands"]), *TABLE["said"].items()]
+
+
+@pytest.mark.parametrize(("line", "said"), MISTAKES)
+def test_mistakes_are_one_line(line, said, typed, tmp_path, request):
     for name, text in TABLE["files"].items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     if "logs/" in line or line.startswith("enjoy.py --algo qlearning"):
         (tmp_path / "logs").symlink_to(request.getfixturevalue("runs"))
     before = set(tmp_path.rglob("*"))
-    code, out, err = type_command(*shlex.split(line))
-    assert code == 2, out + err
-    assert err.count("\n") == 1, err
+    code, out, err = typed(*shlex.split(line))
+    assert (code, err.count("\n")) == (2, 1), out + err
     assert said in err
     assert "Traceback" not in out + err
     assert set(tmp_path.rglob("*")) == before
@@ -90,10 +89,10 @@ def test_mistakes_are_one_line(line, said, type_command, tmp_path, request):
     assert not (out and "audit" in line)
 
 
-def test_no_line_in_a_pipe_is_too_wide(type_command, monkeypatch):
+def test_no_line_in_a_pipe_is_too_wide(typed, monkeypatch, in_this_process):
     monkeypatch.setenv("COLUMNS", "80")
     for words in [*(f"{command} --help" for command in COMMANDS), *TABLE["right"]]:
-        code, out, err = type_command("yardstick", *words.split())
+        code, out, err = typed("yardstick", *words.split())
         assert code in (0, 1), err
         for line in filter(lambda line: " " in line.strip(), out.splitlines()):
             assert len(line) <= (80 if line[:1] in tuple("┏┃┡│└") else 100), words

@@ -56,9 +56,7 @@ def names(folder):
 @pytest.mark.usefixtures("in_this_process")
 def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(typed, own_folder):
     study = own_folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
-    code, out, err = typed("compare.py", *PAIR, "--seeds", 1)
-    assert (code, err) == (0, "")
-    assert "2 runs, 0 of them there already" in out
+    assert "2 runs, 0 of them there already" in typed.done("compare.py", *PAIR, "--seeds", 1)
     first = records(study)
     assert sorted(first) == [("qlearning", "FrozenLake-v1_1"), ("sarsa", "FrozenLake-v1_1")]
     assert names(study) == FILES
@@ -73,8 +71,7 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(typed, own_fo
     assert theirs.equals(ours)
     # Finished runs of other settings stay as they are.
     first = records(study)
-    code, out, err = typed("compare.py", *PAIR, "--seeds", 2, "-params", "gamma:0.9")
-    assert (code, err.count("\n")) == (2, 1)
+    err = typed.refused("compare.py", *PAIR, "--seeds", 2, "-params", "gamma:0.9")
     assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now): give" in err
     assert records(study) == first
     # What a study's record says is enough to do it elsewhere.
@@ -83,8 +80,8 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(typed, own_fo
     assert typed("compare.py", "--resume", "copy", "--no-report")[0] == 0
     columns = ["agent", "seed", "final", "training", "n_timesteps"]
     assert rows(own_folder / "copy")[columns].equals(rows(study)[columns])
-    code, _, err = typed("compare.py", "--resume", "copy", "--seeds", 3)
-    assert (code, "--seeds cannot be given with --resume" in err) == (2, True)
+    said = "--seeds cannot be given with --resume"
+    assert said in typed.refused("compare.py", "--resume", "copy", "--seeds", 3)
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -94,8 +91,7 @@ def test_films_and_pages_of_training(typed, own_folder, monkeypatch):
     monkeypatch.setattr("rl_yardstick.report.page.world_sections.film_of", lambda _: None)
     words = ["--env", "FrozenLake-v1", "--algos", "qlearning", "--n-episodes", 40, "--seeds", 1]
     words += ["-j", 1, "-f", "studies", "--watch-learning", "--render-every", 20]
-    code, out, err = typed("compare.py", *words)
-    assert (code, err) == (0, "")
+    out = typed.done("compare.py", *words)
     study = own_folder / "studies" / "FrozenLake-v1_qlearning"
     place = "learning/qlearning/FrozenLake-v1_1.html"
     assert place in out.split()
@@ -125,22 +121,17 @@ def living(leader):
 
 
 WALKS = Path(__file__).parents[1] / "experiments" / "walks.py"
-SLOW = ["--env", "Walk-v0", "--env-kwargs", "is_slow:True", "--gym-packages", "walks"]
-SLOW += ["--algos", "qlearning"]
-SLOW += ["--no-report", "-n", "2000", "--seeds", "2", "-j", "2", "-f", "studies"]
+SLOW = "--env Walk-v0 --env-kwargs is_slow:True --gym-packages walks --algos qlearning --no-report"
+SLOW = [*SLOW.split(), "-n", "2000", "--seeds", "2", "-j", "2", "-f", "studies"]
 
 
 @pytest.fixture
 def begun(own_folder):
     """A study in the middle of its runs: the command, and its folder."""
     shutil.copy(WALKS, own_folder)
-    process = subprocess.Popen(
-        [sys.executable, str(COMPARE), *SLOW],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    words = [sys.executable, str(COMPARE), *SLOW]
+    told = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(words, **told, start_new_session=True)
     study = own_folder / "studies" / "Walk-v0_qlearning"
     wait_for(lambda: len(list(study.glob("runs/*/*/state.bin"))) == 2)
     yield process, study
@@ -157,8 +148,7 @@ def states(study):
 def test_the_same_command_does_what_is_left(number, typed, own_folder, begun):
     process, study = begun
     # A second command says that the folder is in use, and touches nothing.
-    code, _, err = typed("compare.py", *SLOW, "-params", "gamma:0.5")
-    assert (code, err.count("\n"), "in use by another command" in err) == (2, 1, True)
+    assert "in use by another command" in typed.refused("compare.py", *SLOW, "-params", "gamma:0.5")
     # A terminal sends a signal to all processes.
     (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
     out, err = process.communicate(timeout=120)
@@ -172,8 +162,8 @@ def test_the_same_command_does_what_is_left(number, typed, own_folder, begun):
         assert states(study) == ["interrupted"] * 2
     (own_folder / "mark").touch()
     begun_at = {path: path.stat().st_mtime_ns for path in study.glob("runs/*/*/0.monitor.csv")}
-    code, out, _ = typed("compare.py", "--resume", study, "--gym-packages", "walks", "--no-report")
-    assert (code, "2 runs, 0 of them there already" in out) == (0, True)
+    words = ("--resume", study, "--gym-packages", "walks", "--no-report")
+    assert "2 runs, 0 of them there already" in typed.done("compare.py", *words)
     assert len(begun_at) == 2
     assert states(study) == ["finished"] * 2
     assert names(study) == FILES
@@ -198,19 +188,17 @@ def last_line(out):
 def test_it_grows_until_decided_and_remembers_its_looks(typed, own_folder):
     (own_folder / "bandits.yml").write_text(BANDITS)
     words = ["bandits.yml", "--until-decided", "--no-report", "--max-seeds", 14, "-j", 2, "-f", "s"]
-    code, whole, err = typed("compare.py", *words)
-    assert (code, err) == (0, "")
+    whole = typed.done("compare.py", *words)
     assert "look 1 of 3, at 6 seeds: " in whole
     study = own_folder / "s" / "bandits"
     n_runs, record = len(rows(study)), (study / "study.json").read_bytes()
     last = f"{n_runs} runs, where 14 seeds of each agent would be 42; "
     assert last_line(whole).startswith(last)
-    code, out, _ = typed("compare.py", *words)
-    assert (code, last_line(out)) == (0, last_line(whole))
+    assert last_line(typed.done("compare.py", *words)) == last_line(whole)
     assert (study / "study.json").read_bytes() == record
 
 
-def test_agents_of_the_library_and_blind_ones_are_judged(type_command, tmp_path, monkeypatch):
+def test_agents_of_the_library_and_blind_ones_are_judged(typed, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")  # room for the paths of runs
     log = {"env_kwargs": {"log": "log.csv"}}
     small = {"n_steps": 64, "batch_size": 64}
@@ -219,8 +207,7 @@ def test_agents_of_the_library_and_blind_ones_are_judged(type_command, tmp_path,
     blind, ppo = "logs/thompson/ReplayBandit-v0_1", "logs/ppo/ReplayBandit-v0_1"
     trained("thompson", "ReplayBandit-v0", {"ignore_context": True, **log}, n_timesteps=1500)
     trained("ppo", "ReplayBandit-v0", {**small, **log}, n_timesteps=200)
-    code, out, err = type_command("compare.py", "--logged", "log.csv", "--policy", blind, ppo)
-    assert (code, err) == (0, "")
+    out = typed.done("compare.py", "--logged", "log.csv", "--policy", blind, ppo)
     for run in (blind, ppo):
         assert f"{run} was trained on this log: its figures flatter it" in out
 
@@ -264,8 +251,7 @@ def files(own_folder):
 
 @pytest.mark.usefixtures("in_this_process")
 def test_a_search_finds_better_settings_and_its_re_test_grows_until_decided(typed, files):
-    code, out, err = typed("tune.py", *SEARCH.split())
-    assert (code, err) == (0, "")
+    out = typed.done("tune.py", *SEARCH.split())
     assert "look 1 of 2, at 8 seeds: all pairs are decided" in out
     record = json.loads((PLACE / "tuning.json").read_text())
     assert len(record["trials"]) == 4
@@ -280,13 +266,9 @@ def test_a_search_finds_better_settings_and_its_re_test_grows_until_decided(type
     assert record["retest"]["winner"] == winner
     assert record["retest"]["optimism"] == best["in_search"] - best["held_out"]
     assert record["held_out_seeds"] == [*range(1000, 1008)]
-    code, again, _ = typed("tune.py", *SEARCH.split())
-    assert code == 0
-    assert "16 runs, 16 of them there already" in again
-    code, _, err = typed("tune.py", *SEARCH.split(), "--max-retest-seeds", "20")
-    assert (code, err.count("\n")) == (2, 1)
+    assert "16 runs, 16 of them there already" in typed.done("tune.py", *SEARCH.split())
+    err = typed.refused("tune.py", *SEARCH.split(), "--max-retest-seeds", "20")
     assert "the looks were planned before the first of them and cannot change" in err
     with FileLock(PLACE / ".lock"):
-        code, _, err = typed("tune.py", *SEARCH.split())
-    assert (code, err.count("\n")) == (2, 1)
+        err = typed.refused("tune.py", *SEARCH.split())
     assert f"{PLACE} is in use by another command" in err

@@ -27,10 +27,10 @@ def runs(tmp_path_factory):
 
 
 @pytest.fixture
-def type_enjoy(type_command, runs, tmp_path):
+def type_enjoy(typed, runs, tmp_path):
     """Type a command beside a run of a random agent on ice, with two checkpoints."""
     shutil.copytree(runs, tmp_path, dirs_exist_ok=True)
-    return type_command
+    return typed
 
 
 def episodes(out):
@@ -38,15 +38,15 @@ def episodes(out):
 
 
 def test_so_many_steps_or_so_many_episodes_in_silence_if_asked(type_enjoy, tmp_path):
-    lengths = episodes(type_enjoy(*PLAY)[1])
+    lengths = episodes(type_enjoy.done(*PLAY))
     assert len(lengths) == 10
-    both = episodes(type_enjoy(*PLAY, "-n", "500", "--n-episodes", "3")[1])
+    both = episodes(type_enjoy.done(*PLAY, "-n", "500", "--n-episodes", "3"))
     assert both == lengths[:3]
-    assert sum(episodes(type_enjoy(*PLAY, "-n", "60")[1])) <= 60
-    assert type_enjoy(*PLAY, "--verbose", "0") == (0, "", "")
+    assert sum(episodes(type_enjoy.done(*PLAY, "-n", "60"))) <= 60
+    assert type_enjoy.done(*PLAY, "--verbose", "0") == ""
     words = ["--n-envs", "3", "--n-episodes", "8", "--reward-log", "returns"]
-    _, out, err = type_enjoy("enjoy.py", *PAIR, *words)
-    assert (err, len(episodes(out)), "(sampled, 8 episodes)" in out) == ("", 8, True)
+    out = type_enjoy.done("enjoy.py", *PAIR, *words)
+    assert (len(episodes(out)), "(sampled, 8 episodes)" in out) == (8, True)
     assert len([*tmp_path.glob("returns/*.monitor.csv")]) == 3
 
 
@@ -65,34 +65,29 @@ CHOICES = {
 def test_the_chosen_model_is_played(type_enjoy, choice):
     pair = [] if choice.startswith("logs") else PAIR
     words = [*pair, *choice.split(), "--no-render", "--n-episodes", "3"]
-    code, out, err = type_enjoy("enjoy.py", *words)
-    assert (code, err, len(episodes(out))) == (0, "", 3)
+    out = type_enjoy.done("enjoy.py", *words)
+    assert len(episodes(out)) == 3
     assert out.splitlines()[0] == f"random on {LAKE}: {RUN}/{CHOICES[choice]}"
     assert re.search(r"^return [\d.]+ \(sampled, 3 episodes\)   length [\d.]+$", out, re.M)
 
 
-def test_letters_and_films_of_each_step(type_command, tmp_path):
+def test_letters_and_films_of_each_step(typed, tmp_path):
     trained("random", "Warehouse-v0", n_timesteps=100)
     words = ["enjoy.py", "--algo", "random", "--env", "Warehouse-v0"]
-    code, out, _ = type_command(*words, "--render", "ansi", "-n", "5")
-    assert code == 0
     # The first frame and one for each of the five steps, ten rows of shelves each.
-    assert out.count("#") > 6 * 30
-    code, _, err = type_command(*words, "--record", "film.gif", "-n", "7")
-    assert (code, err) == (0, "")
+    assert typed.done(*words, "--render", "ansi", "-n", "5").count("#") > 6 * 30
+    typed.done(*words, "--record", "film.gif", "-n", "7")
     # Equal frames in a row become one that is shown for longer.
     with Image.open(tmp_path / "film.gif") as picture:
         frames = [picture.seek(n) or picture.info["duration"] for n in range(picture.n_frames)]
     assert sum(frames) == 8 * 1000 // FRAMES_PER_SECOND
 
 
-def test_a_run_is_played_where_its_map_is_not(type_command):
+def test_a_run_is_played_where_its_map_is_not(typed):
     maze = {"env_kwargs": {"desc": ["S..", ".#.", "..G"]}}
     trained("random", "Warehouse-v0", maze, n_timesteps=9)
     words = ["--algo", "random", "--env", "Warehouse-v0", "--render", "ansi", "-n", "1"]
-    code, out, err = type_command("enjoy.py", *words)
-    assert (code, err) == (0, "")
-    assert " of 97 " in out
+    assert " of 97 " in typed.done("enjoy.py", *words)
 
 
 REPLACED = "\x1b[1A\x1b[2K"  # up a line, and it is empty

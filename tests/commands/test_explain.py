@@ -21,53 +21,48 @@ def logs(tmp_path_factory):
 
 
 @pytest.fixture
-def run(type_command, logs, tmp_path):
+def run(typed, logs, tmp_path):
     """A run of Q-learning that has not settled, with checkpoints."""
     shutil.copytree(logs, tmp_path / "logs")
     return "logs/qlearning/FrozenLake-v1_1"
 
 
-def test_a_run_is_explained_in_twelve_lines_and_as_json(type_command, run):
-    code, out, _ = type_command("explain", run, "--json", "why.json")
+def test_a_run_is_explained_in_twelve_lines_and_as_json(typed, run):
+    out = typed.done("explain", run, "--json", "why.json")
     data = json.loads(Path("why.json").read_text())
-    assert code == 0
     assert len(out.splitlines()) <= 14  # which run, twelve lines, what to try
     assert f"gap {data['gap']:.4g}: it returns" in out
     assert sum(part["loss"] for part in data["parts"]) == pytest.approx(data["gap"])
     assert {"name", "loss", "visits", "action", "best", "updates"} <= data["states"][0].keys()
-    zipped = type_command("explain", f"{run}/FrozenLake-v1.zip", "--map", "costs.png")[1]
+    zipped = typed("explain", f"{run}/FrozenLake-v1.zip", "--map", "costs.png")[1]
     assert zipped.splitlines()[1:] == [*out.splitlines()[1:], "map: costs.png"]
     assert Path("costs.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, run):
+def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(typed, run):
     words = ("--test", "n_timesteps:60000", "--test", "gamma:0.5", "--json", "why.json")
-    code, out, _ = type_command("explain", run, *words, "-j", 1)
-    tried = {
-        one["change"]: one["returns"] for one in json.loads(Path("why.json").read_text())["tried"]
-    }
-    assert code == 0
+    out = typed.done("explain", run, *words, "-j", 1)
+    told = json.loads(Path("why.json").read_text())["tried"]
+    tried = {one["change"]: one["returns"] for one in told}
     assert [*tried] == ["as shipped", "as it is", "n_timesteps:60000", "gamma:0.5"]
     assert {len(returns) for returns in tried.values()} == {4}
     assert "n_timesteps:60000 helps most" in out
-    assert "16 runs, 16 of them there already" in type_command("explain", run, *words)[1]
+    assert "16 runs, 16 of them there already" in typed("explain", run, *words)[1]
 
 
-def test_of_a_study_the_median_run_of_a_pair_is_explained(type_command, report_study, tmp_path):
+def test_of_a_study_the_median_run_of_a_pair_is_explained(typed, report_study, tmp_path):
     folder = tmp_path / "moved"
     shutil.copytree(report_study.root, folder)
     write_tables(replace(report_study.analysis.results, root=folder))
     pair = ("--algo", "Q-learning & co", "--env", "FrozenLake-v1")
-    code, out, _ = type_command("explain", folder, *pair, "--json", "why.json")
+    out = typed.done("explain", folder, *pair, "--json", "why.json")
     table = report_study.analysis.results.summary
     rows = table[(table["agent"] == pair[1]) & (table["environment"] == pair[3])]
-    assert code == 0
     assert str(folder) in "".join(out.splitlines()[:2])
     assert json.loads(Path("why.json").read_text())["return"] == pytest.approx(rows["final"].min())
-    code, _, err = type_command("explain", folder, *pair[:2])
-    assert (code, err.count("\n")) == (2, 1)
-    assert "choose one by --env: FrozenLake-v1, Warehouse-v0" in err
+    said = "choose one by --env: FrozenLake-v1, Warehouse-v0"
+    assert said in typed.refused("explain", folder, *pair[:2])
 
 
 # Q-learning in which an episode that is cut off counts as ended.
@@ -90,10 +85,10 @@ def train(make_env, seed, gamma, steps):
 """
 
 
-def test_a_script_of_ones_own(type_command, tmp_path):
+def test_a_script_of_ones_own(typed, tmp_path):
     (tmp_path / "my_audited_script.py").write_text(SCRIPT)
     words = ("--script", "my_audited_script:train", "--seeds", "1", "--json", "out.json")
-    code, out, err = type_command("audit", *words)
+    code, out, err = typed("audit", *words)
     assert (code, err) == (1, "")
     assert out.startswith("target = 1.00 reward + 0.80 next value + 0.00 value where cut off; ")
     assert "\nfault: no-bootstrap-at-truncation\nnearest in tolerances: no-bootstrap-at-tr" in out
@@ -106,13 +101,12 @@ RETURN = "optimal policies return"
 
 
 @pytest.fixture
-def shape(type_command, monkeypatch):
+def shape(typed, monkeypatch):
     """Type the command: its lines, unbroken, and what it writes."""
     monkeypatch.setattr("rl_yardstick.commands.terminal.wrapped", str)
 
     def run(*words):
-        code, out, err = type_command("shaping", *words, "--json", "s.json")
-        assert (code, err) == (0, "")
+        out = typed.done("shaping", *words, "--json", "s.json")
         return out.splitlines(), json.loads(Path("s.json").read_text())
 
     return run
@@ -135,9 +129,8 @@ def test_rewards_that_make_another_policy_optimal(shape):
     words = ("-params", "gamma:0.9", "--train-env-kwargs", "reward_schedule:[1,-1,-0.5]")
     lines, data = shape("--env", "FrozenLake-v1", *words)
     assert lines[1].startswith("discount 0.9: NOT the same policies are optimal: the best actions")
-    assert sum(place["gain"] for place in data["objectives"][0]["states"]) == pytest.approx(
-        0.6971, abs=5e-5
-    )
+    gains = [place["gain"] for place in data["objectives"][0]["states"]]
+    assert sum(gains) == pytest.approx(0.6971, abs=5e-5)
     assert lines[2].startswith("  row 1, column 1: best is left, with the changes down or right; ")
     assert lines[3].endswith("; the optimum is 0.74419: the changes cost 0.6971")
 

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import gymnasium
-import pytest
 
 from rl_yardstick.agents import ALGORITHMS
 
@@ -29,18 +28,12 @@ LAZY = ["--algo", "lazy", "--env", "my/Lake-v0"]
 PLAY = ["--n-episodes", "1", "--render", "none"]
 
 
-@pytest.fixture
-def in_own_folder(own_folder, type_in_own_folder):
-    (own_folder / "my_agents.py").write_text(AGENTS)
-    return type_in_own_folder
-
-
-def test_a_run_does_not_have_modules_imported(in_own_folder, own_folder, monkeypatch, tmp_path):
+def test_a_run_does_not_have_modules_imported(typed, own_folder, monkeypatch, tmp_path):
     """It says what to type instead, from wherever it is asked."""
-    code, out, _ = in_own_folder("train.py", "--list", "--gym-packages", "./my_agents.py")
-    assert code == 0
+    (own_folder / "my_agents.py").write_text(AGENTS)
+    out = typed.done("train.py", "--list", "--gym-packages", "./my_agents.py")
     assert any(line.split()[:3] == ["lazy", "counts", "[rewards]"] for line in out.splitlines())
-    assert in_own_folder("train.py", *LAZY, "--gym-packages", "my_agents", "-n", "40")[0] == 0
+    typed.done("train.py", *LAZY, "--gym-packages", "my_agents", "-n", "40")
     del ALGORITHMS["lazy"], sys.modules["my_agents"], gymnasium.registry["my/Lake-v0"]
     logs = own_folder / "logs"
     run = logs / "lazy" / "my-Lake-v0_1"
@@ -48,13 +41,11 @@ def test_a_run_does_not_have_modules_imported(in_own_folder, own_folder, monkeyp
     monkeypatch.chdir(tmp_path / "elsewhere")
     by_name, by_path = [*LAZY, "-f", logs], [run / "my-Lake-v0.zip", "-f", logs]
     for words in (by_name, by_path):
-        code, _, err = in_own_folder("enjoy.py", *words, *PLAY)
-        assert code == 2
-        assert "was made with modules of yours: add --gym-packages my_agents" in err
+        said = "was made with modules of yours: add --gym-packages my_agents"
+        assert said in typed.refused("enjoy.py", *words, *PLAY)
         assert "my_agents" not in sys.modules
     words = ["--gym-packages", own_folder / "my_agents.py"]
-    code, _, err = in_own_folder("enjoy.py", *by_path, *PLAY, *words)
-    assert (code, err) == (0, "")
+    typed.done("enjoy.py", *by_path, *PLAY, *words)
 
 
 NAMES = ("agents", "envs", "experiments", "pipeline", "mdp", "report", "models")

@@ -1,10 +1,8 @@
 """Agents that are plain classes of the user: trained, compared, played, explained, refused."""
 
 import json
-import signal
 import sys
 import zipfile
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -14,13 +12,10 @@ import pytest
 from rl_yardstick import agents
 from rl_yardstick.agents.own_classes import parameters_of
 from rl_yardstick.experiments.pool import process_pool
-from rl_yardstick.pipeline.callbacks import StateCallback
 from rl_yardstick.pipeline.components import import_modules
-from rl_yardstick.pipeline.errors import Stopped, UserError
+from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.models import load, load_agent, model_of_run
-from rl_yardstick.pipeline.run import Run, resumable
-from rl_yardstick.pipeline.training import train
-from tests.pipeline.short_runs import LAKE, run_of, spec_of
+from tests.pipeline.short_runs import LAKE, cut_off, resumed, run_of, spec_of
 
 MODULE = """
 import random
@@ -149,29 +144,12 @@ def test_it_does_what_a_loop_by_hand_does():
     assert greedy.tolist() == agent.q.argmax(axis=1).tolist()
 
 
-@pytest.mark.parametrize(
-    ("cls", "form"), [("Table", "pickle"), ("Lazy", "pickle"), ("Net", "state_dict")]
-)
-def test_it_goes_on_bit_for_bit_and_its_zip_holds_its_state(cls, form, monkeypatch):
-    spec = spec_for(cls, 150)
+@pytest.mark.usefixtures("states_at_each_moment")
+@pytest.mark.parametrize("cls", ["Table", "Lazy", "Net"])
+def test_it_goes_on_bit_for_bit_and_its_zip_holds_its_state(cls, monkeypatch):
+    spec, form = spec_for(cls, 150), "state_dict" if cls == "Net" else "pickle"
     _, whole = run_of(spec, "whole")
-    save = StateCallback._on_rollout_start
-
-    def until(self):
-        if self.model.num_timesteps == 60:
-            self.run.stop.number = signal.SIGTERM
-        save(self)
-
-    monkeypatch.setattr(StateCallback, "share_of_time", 1e9)
-    monkeypatch.setattr(StateCallback, "shortest_pause", 0.0)
-    with monkeypatch.context() as patch:
-        patch.setattr(StateCallback, "_on_rollout_start", until)
-        with pytest.raises(Stopped):
-            run_of(spec, "parts")
-    run = Run(next(Path("parts").glob("*/*")))
-    with run:
-        again = train(resumable(run.path), run, resumes=True)
-    assert state_of(again.agent.agent) == state_of(whole.agent.agent)
+    run = resumed(cut_off(spec, monkeypatch))
     path = run.model_path(spec)
     assert form in json.loads(zipfile.ZipFile(path).read("data"))["state"]["pairs"][0]
     assert state_of(load(spec, path, None).agent) == state_of(whole.agent.agent)
@@ -214,8 +192,8 @@ def test_it_is_judged_as_it_acts_unless_it_says_how_to_act_without_exploring():
         ("mine.Table", "unknown agent 'mine.Table'"),
     ],
 )
-def test_what_is_no_agent_is_refused(type_in_own_folder, own_folder, name, words):
-    code, _, err = type_in_own_folder("train.py", "--algo", name, "--env", LAKE, "-n", "20")
+def test_what_is_no_agent_is_refused(typed, own_folder, name, words):
+    code, _, err = typed("train.py", "--algo", name, "--env", LAKE, "-n", "20")
     assert code == 2
     assert words in err.splitlines()[0]
     assert ("class MyAgent:\n    def act(self, obs):\n" in err) == (err.count("\n") > 1)
@@ -227,30 +205,25 @@ def test_an_error_of_its_constructor_goes_through():
         run_of(spec_for("Fails", 20))
 
 
-def test_commands_take_it(type_in_own_folder, own_folder, in_this_process):
+def test_commands_take_it(typed, own_folder, in_this_process):
     words = ["--env", LAKE, "-n", "300"]
     algo = ["--algo", "mine:Table"]
     first = [*words, *algo, "--seed", "0", "-params", "epsilon:0.5"]
-    code, out, err = type_in_own_folder("train.py", *first)
-    assert (code, err) == (0, "")
-    assert "--gym-packages mine:Table" in out
+    assert "--gym-packages mine:Table" in typed.done("train.py", *first)
     run = "logs/mine.Table/FrozenLake-v1_1"
-    assert "add --gym-packages mine:Table" in type_in_own_folder("enjoy.py", run)[2]
+    assert "add --gym-packages mine:Table" in typed("enjoy.py", run)[2]
     played = ["enjoy.py", run, "--n-episodes", "1", "--render", "none"]
     for command in (played, ["yardstick", "explain", run]):
-        assert type_in_own_folder(*command, *algo)[::2] == (0, "")
+        assert typed(*command, *algo)[::2] == (0, "")
     zipped = ["-i", f"{run}/FrozenLake-v1.zip", "--seed", "1"]
-    assert type_in_own_folder("train.py", *words, *algo, *zipped)[::2] == (0, "")
+    assert typed("train.py", *words, *algo, *zipped)[::2] == (0, "")
     words += ["--algos", "random", "mine:Table", "mine:Mine", "--seeds", "2", "--no-report"]
-    code, out, err = type_in_own_folder("compare.py", *words)
-    assert (code, err) == (0, "")
-    assert "mine.Table                 undecided" in out
+    assert "mine.Table                 undecided" in typed.done("compare.py", *words)
 
 
-def test_audit_takes_it(type_in_own_folder):
+def test_audit_takes_it(typed, own_folder):
     words = ("--algo", "mine:Table", "--kind", "q_learning", "--seeds", "1")
-    code, out, err = type_in_own_folder("yardstick", "audit", *words)
-    assert (code, err) == (0, ""), out
+    out = typed.done("yardstick", "audit", *words)
     assert out.endswith("0.80 value where cut off\nright\n")
 
 

@@ -40,10 +40,10 @@ def zoo(*commands, cwd):
     return outputs
 
 
-def test_plots_and_enjoy_of_rl_zoo3_take_our_runs(tmp_path, type_command):
+def test_plots_and_enjoy_of_rl_zoo3_take_our_runs(tmp_path, typed):
     """All in one process, since it imports for seconds."""
     for algo, words in AGENTS.items():
-        assert type_command("train.py", "--algo", algo, "--env", ENV_ID, *SHORT, *words)[0] == 0
+        assert typed("train.py", "--algo", algo, "--env", ENV_ID, *SHORT, *words)[0] == 0
     base = ["-f", "logs", "-e", ENV_ID]
     plot = [*base, "-a", *AGENTS, "-l", "ours", "-o", "data", "--no-display", "-print"]
     play = ["--algo", "ppo", "--env", ENV_ID, "-f", "logs", "--no-render", "-n", 150]

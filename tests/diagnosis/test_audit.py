@@ -17,7 +17,7 @@ def verdict_on(tmp_path):
     """The verdict on a program with a replacement."""
 
     def on(program, old="", new="", tag=""):
-        _, name = PROGRAMS[program]
+        name, _ = PROGRAMS[program]
         path = tmp_path / f"audited_{program}{tag}.py"
         path.write_text(text_of(program, old, new))
         if name == "train":

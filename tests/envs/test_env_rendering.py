@@ -64,15 +64,9 @@ def test_a_picture_fits_belongs_to_the_caller_and_is_as_before_after_reset():
 
 
 # Values on both sides of zero, a mark beyond them, and no value.
-BARS = Bars.fitting(
-    "pull 3: arm 1, reward -0.5",
-    [
-        Bar("arm 0", 1.25, "2 pulls", 1.0),
-        Bar("arm 1", -0.5, "1 pulls", -1.0, is_latest=True),
-        Bar("arm 2", None, "-", 2.0),
-    ],
-    [1.25, -1.0, 2.0],
-)
+ARMS = [Bar("arm 0", 1.25, "2 pulls", 1.0), Bar("arm 1", -0.5, "1 pulls", -1.0, is_latest=True)]
+ARMS += [Bar("arm 2", None, "-", 2.0)]
+BARS = Bars.fitting("pull 3: arm 1, reward -0.5", ARMS, [1.25, -1.0, 2.0])
 SCENES = {
     # Every thing there is; a trail that bends; a power source that was collected.
     "map": Scene(("SP#M", "...G", "M.P#"), 6, [(0, 1), (1, 5), (5, 6)], [1], 3),
@@ -127,9 +121,8 @@ def test_text_of_bandits():
     assert shown(env).startswith("no pull yet\n")
     # Of a replay only matched pulls count.
     text = shown(ReplayBandit(LOG, render_mode="ansi"), *[0] * 7)
-    assert text.startswith(
-        "pull 4: arm 0, reward 0.25\n> context 0 (next), arm 0       2 pulls, mean   0.625  ="
-    )
+    row = "> context 0 (next), arm 0       2 pulls, mean   0.625  ="
+    assert text.startswith(f"pull 4: arm 0, reward 0.25\n{row}")
     # Means are shown as they are now.
     env = GaussianBandit([1.0, -1.0], drift_std=0.5, render_mode="ansi")
     text = shown(env, 0)

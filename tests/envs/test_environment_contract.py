@@ -121,7 +121,6 @@ def test_p_is_the_model_as_dictionaries(env_id, kwargs):
     assert [type(value) for value in env.P[0][0][0]] == [float, int, float, bool]
 
 
-MANY = {"segment_probabilities": [1 / 1024] * 1024, "click_rates": [[0.5, 0.5]] * 1024}
 ONE = {"segment_probabilities": [1], "click_rates": [[0.5]]}
 REFUSED = [
     ("Warehouse", {"slip": -0.1}, "slip must be a finite number from 0 to 1, not -0.1"),

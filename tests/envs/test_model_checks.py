@@ -84,9 +84,8 @@ def raises(env, action):
 
 def ladder(reward):
     """Each wrong step leads back to the start: 1 in 30,000 random tries comes to the last state."""
-    table = {
-        s: {0: [(1.0, 0, 0.0, False)], 1: [(1.0, min(s + 1, 15), 0.0, s == 15)]} for s in range(16)
-    }
+    back = [(1.0, 0, 0.0, False)]
+    table = {s: {0: back, 1: [(1.0, min(s + 1, 15), 0.0, s == 15)]} for s in range(16)}
     table[15][1] = [(1.0, 15, reward, True)]
     return table
 

@@ -109,9 +109,8 @@ class Tutorial(gym.Env):
         self.moves |= {2: np.array([-1, 0]), 3: np.array([0, -1])}
 
     def show(self) -> Any:
-        return {"agent": self.agent, "target": self.target}, {
-            "distance": np.linalg.norm(self.agent - self.target, ord=1)
-        }
+        distance = np.linalg.norm(self.agent - self.target, ord=1)
+        return {"agent": self.agent, "target": self.target}, {"distance": distance}
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
@@ -374,9 +373,8 @@ def test_a_shift_of_ten_percent_is_caught(shift: float) -> None:
     prob = found.model.prob.copy()
     prob[..., 0] *= np.where(found.model.prob[..., 0] < 1, 1 + shift, 1)
     rest = found.model.prob[..., 1:].sum(axis=2)
-    prob[..., 1:] *= np.divide(1 - prob[..., 0], rest, out=np.ones_like(rest), where=rest > 0)[
-        ..., None
-    ]
+    scale = np.divide(1 - prob[..., 0], rest, out=np.ones_like(rest), where=rest > 0)
+    prob[..., 1:] *= scale[..., None]
     numbers = {observation: state for state, observation in enumerate(found.observations)}
     for p, refuted in ((found.model.prob, False), (prob, True)):
         model = replace(found.model, prob=p)
@@ -394,11 +392,17 @@ def test_one_impossible_step_refutes() -> None:
 
 def test_the_environment_is_left_as_it_was() -> None:
     env = gym.make("FrozenLake-v1")
-    kinds = type(env), type(env.env), type(env.unwrapped), env.unwrapped.np_random
+    env.reset(seed=3)
+    env.step(1)
+
+    def state() -> list[Any]:
+        base, rng, time = env.unwrapped, env.np_random, env.get_wrapper_attr("_elapsed_steps")
+        return [*map(type, (env, env.env, base)), base.s, time, rng, rng.bit_generator.state]
+
+    before = state()
     model_of(env, **PATIENT)
-    assert (type(env), type(env.env), type(env.unwrapped), env.unwrapped.np_random) == kinds
+    assert state() == before
     assert isinstance(env.env.env, gym.Wrapper)
-    env.reset(seed=1)
     env.step(0)
 
 

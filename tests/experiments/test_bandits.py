@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 
 from rl_yardstick.agents.bandits.runs import run_batch
+from rl_yardstick.experiments import bandits
 from rl_yardstick.experiments import study as studies
 from rl_yardstick.experiments.analysis import analyse
-from rl_yardstick.experiments.bandits import (
-    MAX_POINTS,
-    QUANTILES,
-    PullStatistics,
-    pull_statistics,
-    read_run,
-    run_regret,
-    stacked_statistics,
-)
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline.run import PULLS_FILE, Run
@@ -40,7 +32,7 @@ def test_every_figure_at_every_point_the_plain_way():
     arms, contexts = rng.integers(3, size=(3, 450)), rng.integers(2, size=(3, 450))
     regrets = by_cell[contexts, arms].astype(np.float64)
     rewards = rng.integers(-3, 9, size=(3, 450)).astype(np.float64)
-    found = pull_statistics(arms, rewards, regrets, contexts, 3, 2)
+    found = bandits.pull_statistics(arms, rewards, regrets, contexts, 3, 2)
     before = 0
     for i, pull in enumerate(found.pulls.tolist()):
         block, sums = slice(before, pull), regrets[:, :pull].sum(axis=1)
@@ -49,7 +41,7 @@ def test_every_figure_at_every_point_the_plain_way():
         assert found.optimal[i] == pytest.approx((regrets[:, block] == 0).mean())
         assert found.cumulative_regret[i] == pytest.approx(sums.mean())
         assert found.cumulative_regret_sem[i] == pytest.approx(sums.std(ddof=1) / np.sqrt(3))
-        quantiles = np.quantile(sums, QUANTILES)
+        quantiles = np.quantile(sums, bandits.QUANTILES)
         assert found.cumulative_regret_quantiles[:, i] == pytest.approx(quantiles)
         simple = 0.0
         for run, context in np.ndindex(3, 2):
@@ -58,7 +50,7 @@ def test_every_figure_at_every_point_the_plain_way():
             simple += by_cell[context, most] * here.mean()
         assert found.simple_regret[i] == pytest.approx(simple / 3)
         before = pull
-    assert 200 < len(found.pulls) <= MAX_POINTS
+    assert 200 < len(found.pulls) <= bandits.MAX_POINTS
     assert found.total_reward.tolist() == rewards.sum(axis=1).tolist()
     assert found.total_regret.tolist() == regrets.sum(axis=1).tolist()
     for context in range(2):
@@ -109,8 +101,9 @@ def test_a_batch_is_its_runs(tmp_path, do_study):
     assert rows["training"].tolist() == rows["last_episodes"].tolist() == rewards
     assert len(set(rows["regret"])) > 1
     # What is told of runs that were done one by one is the same too, but for what a batch adds.
-    ours, theirs = batches.pulls["it", "segments"], stacked_statistics(planned.spec, folders)
-    for field in dataclasses.fields(PullStatistics):
+    ours = batches.pulls["it", "segments"]
+    theirs = bandits.stacked_statistics(planned.spec, folders)
+    for field in dataclasses.fields(bandits.PullStatistics):
         if field.name not in {"estimates", "estimates_std", "moments", "posteriors"}:
             one, other = getattr(ours, field.name), getattr(theirs, field.name)
             assert np.array_equal(one, other, equal_nan=True), field.name
@@ -136,8 +129,8 @@ def test_runs_beside_batches(tmp_path, do_study):
         regrets = pulls_in(run.path)["regrets"]
         assert regrets.shape == (2, 64)
         in_time = regrets.T.ravel()[:100]
-        assert np.array_equal(read_run(run.path, 100)["regrets"], in_time)
-        assert run_regret(run) == pytest.approx(regret) == pytest.approx(in_time.sum())
+        assert np.array_equal(bandits.read_run(run.path, 100)["regrets"], in_time)
+        assert bandits.run_regret(run) == pytest.approx(regret) == pytest.approx(in_time.sum())
 
 
 @pytest.mark.parametrize(

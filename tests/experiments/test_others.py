@@ -22,7 +22,7 @@ from rl_yardstick.experiments.logs import find_logs
 from rl_yardstick.experiments.others import PATTERNS, Options, labels_in, results_of
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.report.series import learning_curves
-from tests.pipeline.short_runs import trained
+from tests.pipeline.short_runs import Steady, trained
 
 ROOT = Path(__file__).parents[2]
 
@@ -54,24 +54,8 @@ def episodes(value):
     return [0.0] * 20 + [value - 1, value + 1] * 50
 
 
-class OneStep(gym.Env):
-    """Episodes of one step with the given returns, again and again."""
-
-    observation_space, action_space = gym.spaces.Discrete(2), gym.spaces.Discrete(2)
-
-    def __init__(self, returns):
-        self.returns, self.n = returns, 0
-
-    def reset(self, *, seed=None, options=None):
-        return 0, {}
-
-    def step(self, action):
-        self.n += 1
-        return 0, self.returns[(self.n - 1) % len(self.returns)], True, False, {}
-
-
 def monitor(path, returns):
-    env = Monitor(OneStep(returns), str(path))
+    env = Monitor(Steady(returns), str(path))
     for _ in returns:
         env.reset()
         env.step(0)
@@ -104,14 +88,14 @@ def damaged_monitor(folder, value):
 
 
 def evaluations(folder, value):
-    env = Monitor(OneStep([value - 1, value + 1]))
+    env = Monitor(Steady([value - 1, value + 1]))
     log = EvalCallback(env, eval_freq=8, n_eval_episodes=2, log_path=str(folder), verbose=0)
     learner().learn(16, callback=log)
 
 
 @cache
 def learner():
-    return A2C("MlpPolicy", OneStep([0.0]), n_steps=4, device="cpu", seed=0)
+    return A2C("MlpPolicy", Steady([0.0]), n_steps=4, device="cpu", seed=0)
 
 
 def progress(folder, value, kind="csv"):
@@ -291,12 +275,10 @@ def test_what_is_assumed_is_told(tmp_path):
     columns = "has up to 2 rows for each agent, seed: averaged (other columns: lr)"
     assert columns in told(judge(twice))
     lengths = lengths_table().drop(columns="episode")
-    assert "up to 120 rows for each agent, seed: averaged (other columns: steps)" in told(
-        judge(lengths)
-    )
-    rows = [
-        (a, "X", s, n, s) for a, most in (("a", 20), ("b", 30)) for s in (0, 1) for n in (10, most)
-    ]
+    columns = "up to 120 rows for each agent, seed: averaged (other columns: steps)"
+    assert columns in told(judge(lengths))
+    ends = [(a, s, n) for a, most in (("a", 20), ("b", 30)) for s in (0, 1) for n in (10, most)]
+    rows = [(agent, "X", seed, n, seed) for agent, seed, n in ends]
     made = pd.DataFrame(rows, columns=["agent", "env", "seed", "step", "return"])
     assert "X: the shortest run ends at 20 (a), the longest at 30 (b)" in told(judge(made))
 
@@ -384,8 +366,7 @@ def test_the_commands_of_the_page(typed, own_folder):
 
     for line in re.findall(r"^yardstick (.*?)(?: +#.*)?$", PAGE, re.MULTILINE):
         page = [] if "scores" in line else ["--no-report"]
-        code, out, err = typed("yardstick", *shlex.split(line), "-f", "studies", *page)
-        assert (code, err) == (0, ""), f"{line}\n{out}{err}"
+        typed.done("yardstick", *shlex.split(line), "-f", "studies", *page)
     rows = pd.read_csv("studies/logs/summary.csv").set_index("agent")
     assert rows["final"].to_dict() == finals
     page = Path("studies/scores/report.html").read_text()

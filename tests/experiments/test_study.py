@@ -9,15 +9,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rl_yardstick.experiments import plan as plans
 from rl_yardstick.experiments import study as studies
-from rl_yardstick.experiments.plan import (
-    MAY_DIFFER,
-    StudyRecord,
-    other_settings,
-    plan,
-    specs_of,
-    tuning_seeds,
-)
 from rl_yardstick.experiments.study import (
     AgentSpec,
     EnvironmentSpec,
@@ -110,7 +103,7 @@ def test_an_agent_has_a_file_of_settings_beside_the_study(read, tmp_path):
         "seeds: 1\nenvironments: [FrozenLake-v1]\ntuned: false\nagents:\n  sarsa: {n_timesteps: 9}"
         "\n  mine: {algo: sarsa, conf_file: mine.yml, learning_rate: 0.25}\n"
     )
-    assert [run.spec.hyperparams for run in plan(study, tmp_path)] == [
+    assert [run.spec.hyperparams for run in plans.plan(study, tmp_path)] == [
         {"n_timesteps": 9},
         {"n_timesteps": 7, "gamma": 0.5, "learning_rate": 0.25},
     ]
@@ -149,16 +142,16 @@ def test_a_shipped_study_is_read_back_from_its_record(path, tmp_path):
         return
     study = read_study(path)
     study = replace(study, agents=study.agents[:3], environments=study.environments[:2])
-    record = StudyRecord(study, specs_of(study), looks=(5, 10))
+    record = plans.StudyRecord(study, plans.specs_of(study), looks=(5, 10))
     record.write(tmp_path)
-    assert StudyRecord.read(tmp_path) == record
+    assert plans.StudyRecord.read(tmp_path) == record
 
 
 @pytest.mark.parametrize("content", ["", "{}", '{"study": 3, "looks": [], "specs": []}'])
 def test_a_record_that_is_none(content, tmp_path):
     (tmp_path / "study.json").write_text(content)
     with pytest.raises(UserError, match=r"study\.json"):
-        StudyRecord.read(tmp_path)
+        plans.StudyRecord.read(tmp_path)
 
 
 NOWHERE = Path("nowhere")
@@ -172,12 +165,13 @@ def study_of(*agents, environments=(LAKE,), **fields):
 
 
 def only(study, root=NOWHERE):
-    (planned,) = plan(replace(study, n_seeds=1), root)
+    (planned,) = plans.plan(replace(study, n_seeds=1), root)
     return planned
 
 
 def test_every_agent_on_every_environment_with_every_seed(tmp_path):
-    planned = plan(study_of("qlearning", "sarsa", environments=(LAKE, DRY), n_seeds=3), tmp_path)
+    study = study_of("qlearning", "sarsa", environments=(LAKE, DRY), n_seeds=3)
+    planned = plans.plan(study, tmp_path)
     assert [(run.seed, run.agent, run.environment) for run in planned] == [
         (seed, agent, environment)
         for seed in range(3)
@@ -221,7 +215,7 @@ UNTRAINABLE = [
 def test_what_cannot_be_trained_is_refused_beforehand(tmp_path, algo, settings, complaint):
     agents = AgentSpec("good", "sarsa"), AgentSpec("bad", algo, settings, where="lakes.yml")
     with pytest.raises(UserError, match=rf"^lakes\.yml: bad on FrozenLake-v1: .*{complaint}"):
-        plan(study_of(*agents, n_seeds=2), tmp_path)
+        plans.plan(study_of(*agents, n_seeds=2), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -244,7 +238,7 @@ def test_a_run_is_finished_where_its_folder_says_so(tmp_path):
     assert only(replace(PLAIN, tensorboard=True), tmp_path).is_finished
     # What is written meanwhile is no part of it.
     otherwise = {"log_interval": 7, "pictures": True, "origins": {"gamma": "auto"}}
-    assert otherwise.keys() <= set(MAY_DIFFER)
+    assert otherwise.keys() <= set(plans.MAY_DIFFER)
     record(replace(planned, spec=planned.spec.changed(**otherwise)))
     assert planned.is_finished
     (planned.path / "run.json").write_text("{")
@@ -261,9 +255,9 @@ OTHERS = (
 
 def test_a_run_of_other_settings_does_not_count(tmp_path):
     record(only(PLAIN, tmp_path))
-    assert other_settings([only(PLAIN, tmp_path)]) == []
+    assert plans.other_settings([only(PLAIN, tmp_path)]) == []
     assert not any(only(study, tmp_path).is_finished for study in OTHERS)
-    ((_, differences),) = other_settings([only(OTHERS[0], tmp_path)])
+    ((_, differences),) = plans.other_settings([only(OTHERS[0], tmp_path)])
     assert differences["gamma"][1] == 0.123
 
 
@@ -299,7 +293,7 @@ SEEDS = [
 def test_what_is_said_of_the_seeds(agents, places, seeds, sentence):
     first, count = seeds
     study = study_of(*agents, environments=places, n_seeds=count, first_seed=first)
-    said = seed_sentence(study.seeds, tuning_seeds(study))
+    said = seed_sentence(study.seeds, plans.tuning_seeds(study))
     assert said.startswith(f"Seeds {first} to {first + count - 1}: ")
     assert sentence in said
     assert said.endswith(".")

@@ -65,9 +65,8 @@ def test_discounted_values_of_both_planners_solve_the_equation_of_the_optimum(mo
     one, two = mdp.value_iteration(model, discount), mdp.policy_iteration(model, discount)
     # The tolerance, or with values up to 300 over 1 - 0.99 what rounding leaves.
     assert one.error_bound <= 2e-10
-    np.testing.assert_allclose(
-        one.values, two.values, rtol=0, atol=one.error_bound + two.error_bound
-    )
+    bound = one.error_bound + two.error_bound
+    np.testing.assert_allclose(one.values, two.values, rtol=0, atol=bound)
     after = np.where(model.terminated, 0.0, one.values[model.next_state])
     best = (model.expected_reward + discount * (model.prob * after).sum(axis=2)).max(axis=1)
     np.testing.assert_allclose(one.values[model.reachable], best[model.reachable], atol=1e-9)
@@ -162,9 +161,8 @@ def moments_by_recursion(model, chances, discount, success):
     values, squares = backed_up(model.reward, discount)
     lengths, square_lengths = backed_up(np.ones(model.prob.shape), 1.0)
     rate, _ = backed_up((success & model.terminated).astype(float), 1.0)
-    mean, square, length, square_length, rate = (
-        model.initial @ each for each in (values, squares, lengths, square_lengths, rate)
-    )
+    backed = np.array([values, squares, lengths, square_lengths, rate])
+    mean, square, length, square_length, rate = backed @ model.initial
     return [mean, square - mean**2, length, square_length - length**2, rate], values, visits
 
 

@@ -107,9 +107,8 @@ def test_best_and_worst_under_a_limit_are_those_of_all_optimal_policies(data, mo
     shaped = replace(model, reward=data.draw(rewards))
     found = effect_under_limit(model, shaped, horizon)
     policies = every_policy(model, horizon)
-    returns, others = (
-        np.array([worth(each, p, horizon) for p in policies]) for each in (model, shaped)
-    )
+    both = [[worth(each, p, horizon) for p in policies] for each in (model, shaped)]
+    returns, others = np.array(both)
     ours, theirs = returns >= returns.max() - 1e-9, others >= others.max() - 1e-9
     assert_effect(found, returns, ours, theirs)
     for policy, value in ((found.policy, found.optimum), (found.worst_policy, found.returns[1])):

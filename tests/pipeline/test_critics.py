@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -14,14 +13,7 @@ from rl_yardstick.mdp import TransitionModel, policy_return, state_visitation
 from rl_yardstick.mdp.gaps import expected_estimates
 from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.evaluation import critics
-from rl_yardstick.pipeline.evaluation.critics import (
-    CriticRecorder,
-    KnownWorld,
-    RolloutRecorder,
-    known_world,
-    minibatches,
-    recorder_of,
-)
+from tests.agents.hand_fed import Spaces
 from tests.pipeline.short_runs import LAKE, agent_of, spec_of
 
 
@@ -31,17 +23,17 @@ def chain_world():
     reward = np.array([[[1.0], [0.0]], [[2.0], [0.0]]])
     ends = np.array([[[False], [False]], [[True], [False]]])
     model = TransitionModel(np.ones((2, 2, 1)), following, reward, ends, np.array([1.0, 0.0]))
-    return KnownWorld(model, np.arange(2), horizon=4, masks=None)
+    return critics.KnownWorld(model, np.arange(2), horizon=4, masks=None)
 
 
-class TwoStates(gym.Env):
-    observation_space, action_space = gym.spaces.Discrete(2), gym.spaces.Discrete(2)
+def two_states():
+    return DummyVecEnv([lambda: Spaces(2, 2)])
 
 
 def compared(algo, table, *, explores, **arguments):
-    agent = agent_of(algo, DummyVecEnv([TwoStates]), gamma=0.5, **arguments)
+    agent = agent_of(algo, two_states(), gamma=0.5, **arguments)
     agent.policy.q_tables[:] = th.tensor(table, dtype=th.float64)
-    recorder = CriticRecorder(None, chain_world(), explores=explores)
+    recorder = critics.CriticRecorder(None, chain_world(), explores=explores)
     recorder.model = agent
     return recorder.figures()
 
@@ -81,7 +73,7 @@ def test_which_policy_an_agent_s_values_are_of():
     for algo in follows | maximises:
         spec = spec_of(algo, LAKE)
         agent = agent_of(algo, make_training_env(spec, None))
-        recorder = recorder_of(None, spec, agent)
+        recorder = critics.recorder_of(None, spec, agent)
         assert recorder.explores == (algo in follows), algo
         recorder.model = agent
         assert np.isfinite(recorder.figures()["v_error"]), algo
@@ -93,7 +85,7 @@ def on_ice(**settings):
     spec = spec_of("ppo", LAKE, {"n_envs": 4, "env_kwargs": small})
     settings = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 256, "gamma": 0.9, **settings}
     agent = agent_of("ppo", make_training_env(spec, None), device="cpu", **settings)
-    recorder = RolloutRecorder(None, known_world(spec, agent), explores=True)
+    recorder = critics.RolloutRecorder(None, critics.known_world(spec, agent), explores=True)
     recorder.model = agent
     return agent, recorder.world, recorder
 
@@ -142,7 +134,7 @@ def test_the_exact_gradient_is_that_of_finite_differences():
     reward = chain.model.reward - np.array([0.0, 1.0])[:, None]  # to stay costs 1
     world = replace(chain, model=replace(chain.model, reward=reward), horizon=400)
     settings = {"policy_kwargs": {"net_arch": [3]}, "gamma": 1.0, "n_steps": 8, "batch_size": 8}
-    agent = agent_of("ppo", DummyVecEnv([TwoStates]), device="cpu", **settings)
+    agent = agent_of("ppo", two_states(), device="cpu", **settings)
     agent.policy.double()
     actor = agent.policy.mlp_extractor.forward_actor
     agent.policy.mlp_extractor.forward_actor = lambda features: actor(features.double())
@@ -177,11 +169,11 @@ def test_the_gradient_of_a_minibatch_is_the_one_that_the_library_descends():
     agent, world, _ = on_ice(batch_size=1024, engine="library")
     buffer = collect(agent)
     estimates = buffer.advantages.reshape(-1).astype(np.float64)
-    ((steps, centred),) = minibatches(agent, estimates, 0)
+    ((steps, centred),) = critics.minibatches(agent, estimates, 0)
     assert sorted(steps) == list(range(1024))
     assert centred.mean() == pytest.approx(0.0, abs=1e-9)
     agent.batch_size = 205  # of which 1024 steps are five but for one
-    assert [len(batch) for batch, _ in minibatches(agent, estimates, 0)] == [205] * 4
+    assert [len(batch) for batch, _ in critics.minibatches(agent, estimates, 0)] == [205] * 4
     states = world.states_of(buffer.observations, 1024)
     weights, actions = np.zeros((1, 4, 4)), buffer.actions.reshape(-1).astype(int)
     np.add.at(weights[0], (states[steps], actions[steps]), centred / 1024)
@@ -216,7 +208,7 @@ def test_cosine_and_signal_to_noise_of_multiples_of_the_exact_gradient():
 def test_where_states_look_alike_values_are_compared_and_rollouts_are_not():
     spec = spec_of("ppo", "ShortCorridor-v0")
     agent = agent_of("ppo", make_training_env(spec, None), device="cpu")
-    recorder = recorder_of(None, spec, agent)
-    assert type(recorder) is CriticRecorder
+    recorder = critics.recorder_of(None, spec, agent)
+    assert type(recorder) is critics.CriticRecorder
     recorder.model = agent
     assert set(recorder.figures()) == {"v_error", "v_error_visited", "entropy"}

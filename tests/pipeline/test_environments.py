@@ -13,13 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn, optim
 
 from rl_yardstick.envs.wrappers import OneHotObservation, ScaleReward, TerminationReward
-from rl_yardstick.pipeline.components import (
-    build,
-    build_value,
-    find_class,
-    import_modules,
-    module_name,
-)
+from rl_yardstick.pipeline import components
 from rl_yardstick.pipeline.environments import (
     EVALUATION_TIME_LIMIT,
     kwargs_of,
@@ -104,12 +98,10 @@ def test_evaluation_always_has_a_time_limit():
         assert [time_limit(env) for env in made] == [limit] * 2
 
 
+OURS = "rl_yardstick.envs.wrappers"
 WRAPPED = {
-    "env_wrapper": [
-        {"rl_yardstick.envs.wrappers.TerminationReward": {"reward": 5}},
-        "rl_yardstick.envs.wrappers.OneHotObservation",
-    ],
-    "train_env_wrapper": [{"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.5}}],
+    "env_wrapper": [{f"{OURS}.TerminationReward": {"reward": 5}}, f"{OURS}.OneHotObservation"],
+    "train_env_wrapper": [{f"{OURS}.ScaleReward": {"scale": 0.5}}],
 }
 
 
@@ -170,10 +162,10 @@ CALLBACKS = "stable_baselines3.common.callbacks"
 @pytest.mark.parametrize(("name", "found"), TABLES["names"])
 def test_which_names_are_classes(name, found):
     if found in name:
-        assert find_class(name, KINDS, "here", []).__name__ == found
+        assert components.find_class(name, KINDS, "here", []).__name__ == found
     else:
         with pytest.raises(UserError, match=r"^here: ") as caught:
-            find_class(name, KINDS, "here", [])
+            components.find_class(name, KINDS, "here", [])
         assert found in str(caught.value)
 
 
@@ -190,8 +182,9 @@ COMPONENTS = [
 @pytest.mark.parametrize(("base", "name", "kwargs", "said"), COMPONENTS)
 def test_components_that_are_wrong(base, name, kwargs, said, tmp_path):
     inner = [] if base is BaseCallback else [gym.make(CART)]
+    component = Component(name=name, kwargs=kwargs)
     with pytest.raises(UserError) as caught:
-        build(Component(name=name, kwargs=kwargs), base, "callback", [], tmp_path, *inner)
+        components.build(component, base, "callback", [], tmp_path, *inner)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -199,7 +192,7 @@ def test_components_that_are_wrong(base, name, kwargs, said, tmp_path):
 def test_callbacks_write_into_the_run_folder_alone(tmp_path):
     def made(name, **kwargs):
         component = Component(name=f"{CALLBACKS}.{name}", kwargs=kwargs)
-        return build(component, BaseCallback, "callback", [], tmp_path)
+        return components.build(component, BaseCallback, "callback", [], tmp_path)
 
     assert isinstance(made("StopTrainingOnMaxEpisodes", max_episodes=5), StopTrainingOnMaxEpisodes)
     assert made("CheckpointCallback", save_freq=10).save_path == str(tmp_path)
@@ -214,12 +207,8 @@ def test_callbacks_write_into_the_run_folder_alone(tmp_path):
 
 
 def test_arguments_make_an_agent():
-    kwargs = {
-        "net_arch": {"pi": [8], "vf": [16]},
-        "activation_fn": "nn.ELU",
-        "optimizer_class": "th.optim.Adam",
-        "optimizer_kwargs": {"fused": True},  # a setting of the library's
-    }
+    kwargs = {"net_arch": {"pi": [8], "vf": [16]}, "activation_fn": "nn.ELU"}
+    kwargs |= {"optimizer_class": "th.optim.Adam", "optimizer_kwargs": {"fused": True}}
     entry = {"learning_rate": "lin_1e-3", "n_steps": "64", "policy_kwargs": kwargs, "n_envs": 1}
     model = make_agent(spec_of("ppo", CART, entry), None)
     assert isinstance(model.policy.mlp_extractor.policy_net[1], nn.ELU)
@@ -227,7 +216,7 @@ def test_arguments_make_an_agent():
     assert isinstance(model.policy.optimizer, optim.Adam)
     assert model.policy.optimizer.defaults["fused"] is True
     assert math.isclose(model.lr_schedule(0.5), 5e-4)
-    assert build_value([{"a": "no.such.name-"}], "here", []) == [{"a": "no.such.name-"}]
+    assert components.build_value([{"a": "no.such.name-"}], "here", []) == [{"a": "no.such.name-"}]
     # Gaussian noise on the values of a table, which no key of the file format may swallow.
     entry = {"exploration": "gaussian_noise", "noise_std": 0.25}
     assert make_agent(spec_of("qlearning", entry=entry), None).noise_std == 0.25
@@ -257,8 +246,8 @@ def test_modules_that_were_typed(own_folder, monkeypatch, how):
     else:
         (folder / f"{name}.py").write_text(text)
     typed = f"there/{name}.py" if how == "file" else name
-    import_modules([typed])
-    assert module_name(typed) == name
+    components.import_modules([typed])
+    assert components.module_name(typed) == name
     spec = spec_of("random", CART, {"env_wrapper": f"{name}.Twice"}, gym_packages=[typed])
     env = make_training_env(spec, None)
     env.reset()
@@ -275,4 +264,4 @@ def test_modules_that_cannot_be_imported(own_folder, monkeypatch):
     ):
         (own_folder / typed).with_suffix(".py").write_text(text)
         with pytest.raises(UserError, match=said):
-            import_modules([typed])
+            components.import_modules([typed])

@@ -208,9 +208,8 @@ INTO_THE_HOLE = {0: prefers(2), 1: prefers(1)}  # on the lake 1 is down and 2 is
     ],
 )
 def test_what_a_failed_agent_does_instead(env_id, rows, instead):
-    spec = spec_of(
-        "qlearning", env_id, {"env_kwargs": {"is_slippery": False} if env_id == LAKE else {}}
-    )
+    dry = {"is_slippery": False} if env_id == LAKE else {}
+    spec = spec_of("qlearning", env_id, {"env_kwargs": dry})
     agent, evaluator = agent_of("qlearning", make_training_env(spec, None)), exact_evaluator(spec)
     rows = evaluator.optimum[1].astype(float) if rows is WELL else rows
     for state, row in rows.items() if isinstance(rows, dict) else [(slice(None), rows)]:

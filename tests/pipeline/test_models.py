@@ -178,9 +178,8 @@ def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tm
     # An update follows every fourth step, and training ends with one.
     assert (before.pos, after.pos) == (200, 252)
     np.testing.assert_array_equal(after.observations[:200], before.observations[:200])
-    with pytest.raises(
-        UserError, match=r"ReplayBuffer of n_envs:1 .* need a ReplayBuffer of n_envs:2"
-    ):
+    said = r"ReplayBuffer of n_envs:1 .* need a ReplayBuffer of n_envs:2"
+    with pytest.raises(UserError, match=said):
         train_to(tmp_path / "no", "dqn", {**SMALL_DQN, "n_envs": 2}, 50, **fields)
     assert not (tmp_path / "no").exists()
     # Playing needs none.
@@ -190,15 +189,9 @@ def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tm
     env.close()
 
 
-CONFIG = OrderedDict(
-    frame_stack=2,
-    learning_rate="lin_0.1",
-    n_envs=2,
-    n_timesteps=1e5,
-    normalize="dict(norm_obs=True, norm_reward=False)",
-    policy="MlpPolicy",
-    policy_kwargs="dict(net_arch=[4], activation_fn=nn.ReLU)",
-)
+CONFIG = OrderedDict(frame_stack=2, learning_rate="lin_0.1", n_envs=2, n_timesteps=1e5)
+CONFIG |= {"normalize": "dict(norm_obs=True, norm_reward=False)", "policy": "MlpPolicy"}
+CONFIG |= {"policy_kwargs": "dict(net_arch=[4], activation_fn=nn.ReLU)"}
 
 
 def cart_poles(n_envs, statistics=None):
@@ -284,14 +277,10 @@ def test_returns_of_rewards_as_training_normalised_them(zoo):
     env.close()
 
 
-SAID = ("args.yml", "config.yml")
+SAID, A2C_ON_CART = ("args.yml", "config.yml"), {"algo": "a2c", "env_id": CART}
 REFUSED = [
     ((), {}, "is in no run folder: say what it is with --algo"),
-    (
-        (),
-        {"algo": "a2c", "env_id": CART},
-        r"trained on observations of size \(8,\), not Box\(.*: give its --env and",
-    ),
+    ((), A2C_ON_CART, r"trained on observations of size \(8,\), not Box\(.*: give its --env and"),
     (SAID, {}, "name their file with --vec-normalize"),
     ((*SAID, "vec_normalize.pkl"), {"algo": "dqn"}, "it is no dqn zip: try --algo ppo or a2c$"),
 ]

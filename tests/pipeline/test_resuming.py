@@ -14,13 +14,11 @@ import torch as th
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rl_yardstick.experiments.results import read_compared
-from rl_yardstick.pipeline.callbacks import StateCallback
-from rl_yardstick.pipeline.errors import Stopped, UserError
+from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation import sampled
 from rl_yardstick.pipeline.run import Run, resumable
 from rl_yardstick.pipeline.settings import override, read_entry, read_spec
-from rl_yardstick.pipeline.training import train
-from tests.pipeline.short_runs import CART, LAKE, SWING, run_of
+from tests.pipeline.short_runs import CART, LAKE, SWING, cut_off, resumed, run_of
 
 COMPILED = {"engine": "compiled"}
 SMALL = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2}
@@ -57,11 +55,8 @@ TRAININGS = [
 
 
 @pytest.fixture(autouse=True)
-def quick_states(monkeypatch, tmp_path, quick_runs):
-    """A state at each safe moment."""
+def quick_states(monkeypatch, tmp_path, quick_runs, states_at_each_moment):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(StateCallback, "share_of_time", 1e9)
-    monkeypatch.setattr(StateCallback, "shortest_pause", 0.0)
 
 
 def spec_of(env_id, algo, steps, settings, **fields):
@@ -72,35 +67,6 @@ def spec_of(env_id, algo, steps, settings, **fields):
     if "log_interval" in fields:
         fields["tensorboard_log"] = "log"
     return read_spec(algo, env_id, override(entry, changes), seed=3, pictures=False, **fields)
-
-
-def cut_off(spec, monkeypatch, share=0.4, run=None):
-    """A new run, or one that is resumed, stopped after a share of its steps or episodes."""
-    save, stopped = StateCallback._on_rollout_start, []
-
-    def until(self):
-        done = self.model.num_timesteps / (spec.n_timesteps or 150)
-        if not self.resumes and done >= share:
-            self.run.stop.number = signal.SIGTERM
-            stopped.append(self.run)
-        save(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(StateCallback, "_on_rollout_start", until)
-        with pytest.raises(Stopped):
-            resumed(run) if run else run_of(spec, "parts")
-    run = Run(stopped[0].path)
-    assert run.recorded()["state"] == "interrupted"
-    assert run.state_path.exists()
-    return run
-
-
-def resumed(run):
-    """The run, whose training goes on in new objects."""
-    again = Run(run.path)
-    with again:
-        train(resumable(run.path), again, resumes=True)
-    return again
 
 
 def content(path):

@@ -19,15 +19,6 @@ from hypothesis import strategies as st
 from rl_yardstick.pipeline import files
 from rl_yardstick.pipeline.callbacks import EvaluationCallback
 from rl_yardstick.pipeline.errors import Stopped, UserError
-from rl_yardstick.pipeline.files import (
-    json_text,
-    portable_name,
-    read_bytes,
-    read_json,
-    read_text,
-    replacing,
-    write_json,
-)
 from rl_yardstick.pipeline.run import Run, Stop, numbered_runs
 from tests.pipeline.short_runs import CART, LAKE, TABLES, run_of, spec_of, trained
 
@@ -116,19 +107,20 @@ def test_an_error_is_recorded_and_what_was_written_stays(monkeypatch):
 def test_a_file_has_its_name_when_it_is_whole(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("before")
-    with pytest.raises(ZeroDivisionError), replacing(path) as beside:
+    with pytest.raises(ZeroDivisionError), files.replacing(path) as beside:
         beside.write_text(f"half {beside.suffix == '.txt'}: {1 / 0}")
     assert path.read_text() == "before"
     handler, limits = signal.getsignal(signal.SIGXFSZ), resource.getrlimit(resource.RLIMIT_FSIZE)
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))  # as if the disk were full
     try:
-        with pytest.raises(OSError, match="File too large") as full, replacing(path) as beside:
+        full = pytest.raises(OSError, match="File too large")
+        with full as refused, files.replacing(path) as beside:
             beside.write_bytes(bytes(1000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, handler)
-    assert full.value.filename == str(path)
+    assert refused.value.filename == str(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a.txt"]
 
 
@@ -139,33 +131,38 @@ def test_only_regular_files_of_moderate_size_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     begun = time.monotonic()
     for call, said in (
-        (lambda: read_bytes(tmp_path / "large", 10), "is larger than 10 bytes"),
-        (lambda: read_bytes(tmp_path / "pipe"), "is no regular file"),
-        (lambda: read_bytes(tmp_path), "is a directory|is no regular file"),
-        (lambda: read_bytes(tmp_path / "none"), "no such file"),
-        (lambda: read_json(tmp_path / "bad.json"), r"bad\.json is no valid JSON"),
-        (lambda: read_text(tmp_path / "latin.txt"), "is no UTF-8 text"),
+        (lambda: files.read_bytes(tmp_path / "large", 10), "is larger than 10 bytes"),
+        (lambda: files.read_bytes(tmp_path / "pipe"), "is no regular file"),
+        (lambda: files.read_bytes(tmp_path), "is a directory|is no regular file"),
+        (lambda: files.read_bytes(tmp_path / "none"), "no such file"),
+        (lambda: files.read_json(tmp_path / "bad.json"), r"bad\.json is no valid JSON"),
+        (lambda: files.read_text(tmp_path / "latin.txt"), "is no UTF-8 text"),
     ):
         with pytest.raises(UserError, match=said):
             call()
     assert time.monotonic() - begun < 20
+    # Into such as /dev/stdout results are written.
+    reading = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    files.write_json(tmp_path / "pipe", [1])
+    assert json.loads(os.read(reading, 99)) == [1]
+    os.close(reading)
 
 
 @settings(max_examples=40)
 @given(st.text(min_size=1))
 def test_a_portable_name_is_one_and_stays_one(name):
-    found = portable_name(name)
-    assert portable_name(found) == found
+    found = files.portable_name(name)
+    assert files.portable_name(found) == found
     assert not set('<>:"/\\|?*') & set(found)
     assert len(found.encode(errors="replace")) <= files.LONGEST_NAME
 
 
 def test_json_has_no_nan_and_keeps_infinity(tmp_path):
     data = {"a": np.float64(0.1), "b": [math.nan, -math.inf], "c": np.arange(2), 3: None}
-    write_json(tmp_path / "a.json", data)
+    files.write_json(tmp_path / "a.json", data)
     read = json.loads((tmp_path / "a.json").read_text())
     assert read == {"a": 0.1, "b": [None, -math.inf], "c": [0, 1], "3": None}
-    assert json_text(math.inf) == "1e999"
+    assert files.json_text(math.inf) == "1e999"
 
 
 SMALL_PPO = {"n_steps": 32, "batch_size": 16, "n_epochs": 1, "n_envs": 1}

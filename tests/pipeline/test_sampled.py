@@ -1,6 +1,5 @@
 """Sampled evaluation: it repeats, leaves training alone, takes its share, and has a yardstick."""
 
-import itertools
 from functools import partial
 
 import gymnasium as gym
@@ -24,7 +23,7 @@ from rl_yardstick.pipeline.evaluation.sampled import (
     evaluate_compiled,
     evaluation_seed,
 )
-from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of
+from tests.pipeline.short_runs import CART, LAKE, Steady, agent_of, run_of, spec_of
 
 CAR = "MountainCar-v0"
 PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
@@ -59,33 +58,12 @@ def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_strea
 
     def seeds_of_runs(seeds):
         """Of agents and evaluations, and of environments of any two entries."""
-        begun = [
-            evaluation_seed(seed, p) + i for seed in seeds for p in PURPOSES for i in range(10)
-        ]
+        first = [evaluation_seed(seed, p) for seed in seeds for p in PURPOSES]
+        begun = [start + i for start in first for i in range(10)]
         environments = (range(seeds.start * n, seeds.stop * n) for n in range(1, 33))
         return {*seeds, *begun}.union(*environments)
 
     assert not seeds_of_runs(range(10)) & seeds_of_runs(range(1000, 1010))
-
-
-class Steady(gym.Env):
-    """Episodes of one length, with the returns that are given, again and again."""
-
-    observation_space = gym.spaces.Discrete(2)
-    action_space = gym.spaces.Discrete(2)
-
-    def __init__(self, returns, length):
-        self.returns, self.length = itertools.cycle(returns), length
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps, self.worth = 0, next(self.returns)
-        return 0, {}
-
-    def step(self, action):
-        self.steps += 1
-        ends = self.steps == self.length
-        return 0, self.worth * ends, ends, False, {}
 
 
 def steady(monkeypatch, returns, length, n_timesteps):
@@ -171,6 +149,5 @@ def test_compiled_play_is_the_same_to_the_bit(monkeypatch, algo, env_id, wrapper
         assert (found.returns.dtype, found.lengths.dtype) == (expected.returns.dtype, np.int64)
         assert found.successes is expected.successes is None
     # Where evaluation is exact, or nothing is compiled, there is no copy.
-    assert [engine.compiled_copy(make_vec_env(name, 1)) for name in (LAKE, "Acrobot-v1")] == [
-        None
-    ] * 2
+    copies = [engine.compiled_copy(make_vec_env(name, 1)) for name in (LAKE, "Acrobot-v1")]
+    assert copies == [None] * 2

@@ -11,43 +11,27 @@ from hypothesis import strategies as st
 
 from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from rl_yardstick.envs.known_models import transition_model
-from rl_yardstick.pipeline import components
+from rl_yardstick.pipeline import components, settings
 from rl_yardstick.pipeline.components import constructor_arguments, read_signature
 from rl_yardstick.pipeline.environments import check_fit, make_single_env
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.settings import (
-    HYPERPARAMS,
-    SPECIAL,
-    TUNED_ON,
-    entry_names,
-    literal,
-    override,
-    parse_assignments,
-    parse_yaml,
-    read_entry,
-    read_saved,
-    read_spec,
-    read_yaml,
-    seeds_tuned_on,
-    training_follows,
-)
 from rl_yardstick.pipeline.spec import TrainSpec
 from tests.peers.peer_environment import peer_folder
 from tests.pipeline.short_runs import TABLES
 
 ZOO_FILES = sorted((peer_folder("rl_zoo3") / "hyperparams").glob("*.yml"))
-FILES = sorted(HYPERPARAMS.glob("*.yml"))
-READ = {path.stem: read_yaml(path) for path in FILES}
+FILES = sorted(settings.HYPERPARAMS.glob("*.yml"))
+READ = {path.stem: settings.read_yaml(path) for path in FILES}
 SPECIALISTS = {"angle"}  # whose entries stand in for no others
 
 
 def spec_of(algo="qlearning", env_id="FrozenLake-v1", **entry):
-    return read_spec(algo, env_id, {"n_timesteps": 10, **entry})
+    return settings.read_spec(algo, env_id, {"n_timesteps": 10, **entry})
 
 
 @pytest.mark.parametrize(("text", "value"), TABLES["literals"])
 def test_what_is_typed(text, value):
-    assert literal(text) == value
+    assert settings.literal(text) == value
 
 
 PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
@@ -56,15 +40,15 @@ PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) |
 @given(st.recursive(PLAIN, lambda inner: st.lists(inner, max_size=3), max_leaves=9))
 def test_a_literal_is_read_back_from_its_repr(value):
     if "inf" not in repr(value):
-        assert literal(repr(value)) == value
+        assert settings.literal(repr(value)) == value
 
 
 @given(st.text())
 def test_junk_is_read_or_refused_in_one_line(text):
-    literal(text)
-    for read in (lambda: parse_yaml(text, "here"), lambda: parse_assignments([text], "-params")):
+    settings.literal(text)
+    for read, words in ((settings.parse_yaml, text), (settings.parse_assignments, [text])):
         try:
-            read()
+            read(words, "here")
         except UserError as error:
             (line,) = str(error).splitlines()
             assert len(line) < 600
@@ -83,11 +67,11 @@ def test_files_that_are_wrong(text, said, tmp_path):
     path = tmp_path / "mine.yml"
     path.write_text(text)
     with pytest.raises(UserError) as caught:
-        read_entry("ppo", "A", path)
+        settings.read_entry("ppo", "A", path)
     assert said in str(caught.value)
     assert "mine.yml" in str(caught.value)
     with pytest.raises(UserError, match="Python files are not run"):
-        read_entry("ppo", "A", tmp_path / "config.py")
+        settings.read_entry("ppo", "A", tmp_path / "config.py")
 
 
 def test_the_table_of_arguments_is_up_to_date():
@@ -100,18 +84,17 @@ def test_the_table_of_arguments_is_up_to_date():
 
 @pytest.mark.parametrize("path", ZOO_FILES, ids=lambda path: path.stem)
 def test_rl_zoo3_entries_load_unchanged(path):
-    algo, read = path.stem, read_yaml(path)
+    algo, read = path.stem, settings.read_yaml(path)
     assert read == yaml.safe_load(path.read_text())
     if algo == "her":  # it tells of itself that it is no longer used
         return
     for env_id in read:
-        entry = read_entry(algo, env_id, path)
-        spec = read_spec(algo, env_id, entry)
+        entry = settings.read_entry(algo, env_id, path)
+        spec = settings.read_spec(algo, env_id, entry)
         assert spec.n_timesteps == int(float(read[env_id]["n_timesteps"]))
         assert spec.n_envs == read[env_id].get("n_envs", 1)
-        assert spec.algorithm.keys() == entry.keys() - set(SPECIAL) - (
-            {"noise_std"} if "noise_type" not in entry else set()
-        )
+        unused = {"noise_std"} if "noise_type" not in entry else set()
+        assert spec.algorithm.keys() == entry.keys() - set(settings.SPECIAL) - unused
         if (algo, env_id) == ("ppo_lstm", "default"):
             continue  # a slip that rl_zoo3 stumbles over itself: RecurrentPPO knows no MlpPolicy
         assert constructor_arguments(spec, load_algorithm(algo), False)
@@ -133,7 +116,7 @@ def test_which_entry_is_taken(tmp_path, env_id, kwargs, gamma):
     entries = [*names, "FrozenLake-v1", "FrozenLake8x8-v1"]
     text = yaml.dump({name: {"gamma": i / 10} for i, name in enumerate(entries)})
     (tmp_path / "mine.yml").write_text(text)
-    assert read_entry("sarsa", env_id, tmp_path / "mine.yml", kwargs) == {"gamma": gamma}
+    assert settings.read_entry("sarsa", env_id, tmp_path / "mine.yml", kwargs) == {"gamma": gamma}
 
 
 def test_each_entry_has_the_seeds_that_it_was_tuned_on(tmp_path):
@@ -143,43 +126,43 @@ def test_each_entry_has_the_seeds_that_it_was_tuned_on(tmp_path):
         "Cliff-v0: [{first: 0, count: 1}, {first: 100, count: 2}]}\n"
         "default: {n_timesteps: 5}\nLake-v0: {n_timesteps: 6}\nCliff-v0: {n_timesteps: 7}\n"
     )
-    assert seeds_tuned_on("dqn", "Lake-v0", path) == (range(10),)
-    assert seeds_tuned_on("an_agent_without_a_file", "Lake-v0") is None
-    assert seeds_tuned_on("dqn", "Cliff-v0", path) == (range(1), range(100, 102))
+    assert settings.seeds_tuned_on("dqn", "Lake-v0", path) == (range(10),)
+    assert settings.seeds_tuned_on("an_agent_without_a_file", "Lake-v0") is None
+    assert settings.seeds_tuned_on("dqn", "Cliff-v0", path) == (range(1), range(100, 102))
     path.write_text("tuned_on: {Lake-v0: 5}\nLake-v0: {}\n")
     with pytest.raises(UserError, match="must map entries to seeds"):
-        seeds_tuned_on("dqn", "Lake-v0", path)
+        settings.seeds_tuned_on("dqn", "Lake-v0", path)
     path.write_text("default: {n_timesteps: 5}\n")
-    assert seeds_tuned_on("dqn", "Lake-v0", path) is None  # who does not tell is not known
+    assert settings.seeds_tuned_on("dqn", "Lake-v0", path) is None  # who does not tell is not known
 
 
 def test_every_file_is_an_agents_and_every_agent_has_one():
     names = {f"{name}.yml" for name in ALGORITHMS}
-    found = {path.name for path in HYPERPARAMS.iterdir()}
+    found = {path.name for path in settings.HYPERPARAMS.iterdir()}
     assert found == {*names, "search_spaces", "arguments.json"}
 
 
 @pytest.mark.parametrize("algo", READ)
 def test_every_entry_builds_and_fits_its_agent_and_environment(algo):
-    names = [name for name in READ[algo] if name != TUNED_ON]
+    names = [name for name in READ[algo] if name != settings.TUNED_ON]
     assert set(names) - {"default"} <= set(gym.registry)
-    assert entry_names(algo) == [name for name in names if name != "default"]
+    assert settings.entry_names(algo) == [name for name in names if name != "default"]
     assert ("default" in names) == (algo not in SPECIALISTS)
-    for env_id in entry_names(algo):
-        spec = read_spec(algo, env_id, read_entry(algo, env_id))
+    for env_id in settings.entry_names(algo):
+        spec = settings.read_spec(algo, env_id, settings.read_entry(algo, env_id))
         assert [spec.n_timesteps, spec.n_episodes].count(None) == 1
         assert spec.n_envs <= 32  # up to which seeds are known to lie apart
         assert constructor_arguments(spec, load_algorithm(algo), False)
         assert TrainSpec.model_validate(json.loads(spec.model_dump_json())) == spec
         # The same settings, given as an entry, are the same training.
-        again = read_spec(algo, env_id, spec.hyperparams)
+        again = settings.read_spec(algo, env_id, spec.hyperparams)
         assert again.changed(origins={}) == spec.changed(origins={})
         check_fit(spec)
         training, evaluation = make_single_env(spec, training=True), make_single_env(spec)
         # What was learnt in the one must be of use in the other.
         assert training.observation_space == evaluation.observation_space
         assert training.action_space == evaluation.action_space
-        for seeds in seeds_tuned_on(algo, env_id):
+        for seeds in settings.seeds_tuned_on(algo, env_id):
             assert not set(seeds) & set(range(1000, 2000))  # which are kept for judgement
 
 
@@ -190,17 +173,17 @@ def test_settings_of_run_folders_of_rl_zoo3(tmp_path):
         '  - - normalize\n    - "dict(norm_obs=True)"\n'
         "  - - freq\n    - !!python/tuple\n      - 1\n      - step\n"
     )
-    found = read_saved(path)
+    found = settings.read_saved(path)
     assert found == {"n_envs": 8, "normalize": {"norm_obs": True}, "freq": [1, "step"]}
     path.write_text("!!python/object/apply:os.system ['x']\n")
     with pytest.raises(UserError, match="is no valid YAML"):
-        read_saved(path)
+        settings.read_saved(path)
 
 
 def test_a_typed_budget_replaces_the_entrys_also_in_another_unit():
     entry = {"n_timesteps": 5, "gamma": 0.9}
-    assert override(entry, {"n_episodes": 3}) == {"n_episodes": 3, "gamma": 0.9}
-    assert override(entry, {"gamma": 1.0}) == {"n_timesteps": 5, "gamma": 1.0}
+    assert settings.override(entry, {"n_episodes": 3}) == {"n_episodes": 3, "gamma": 0.9}
+    assert settings.override(entry, {"gamma": 1.0}) == {"n_timesteps": 5, "gamma": 1.0}
 
 
 def test_what_is_asked_for_wins_over_an_entrys_variant_for_training():
@@ -212,7 +195,7 @@ def test_what_is_asked_for_wins_over_an_entrys_variant_for_training():
     ):
         typed = {"env_kwargs": {"shelf_reward": shelf}, **more}
         entry = {**typed, "train_env_kwargs": variant}
-        found, told = training_follows(entry, typed)
+        found, told = settings.training_follows(entry, typed)
         assert found == {**entry, "train_env_kwargs": kept}
         assert bool(told) == is_told
 

@@ -97,6 +97,7 @@ def test_another_order_of_actions_is_found(lake):
 def forms(values):
     """The same table in the forms in which people hold it."""
     pairs = {(s, a): values[s, a] for s, a in np.ndindex(values.shape)}
+    rows = [(*pair, value) for pair, value in pairs.items()]
     top = values == values.max(axis=1, keepdims=True)
     return {
         "a list": values.tolist(),
@@ -118,9 +119,7 @@ def forms(values):
         "below the actions": np.vstack([range(4), values]),
         "a tensor": th.tensor(values),
         "a frame": pd.DataFrame(values).sample(frac=1, random_state=0),
-        "a long frame": pd.DataFrame(
-            [(*pair, value) for pair, value in pairs.items()], columns=["state", "action", "q"]
-        ),
+        "a long frame": pd.DataFrame(rows, columns=["state", "action", "q"]),
         "a series": pd.Series(values.argmax(axis=1)),
         "a chooser": SimpleNamespace(choose_action=lambda state: values[state].argmax()),
     }
@@ -219,12 +218,10 @@ def test_tables_need_no_pytorch_and_files_run_nothing(tmp_path, typed, monkeypat
     np.save("class/deeper/zeros.npy", np.zeros((16, 4)))
     (tmp_path / "class" / "evil.pkl").write_bytes(b"cos\nmkdir\n(Vmark\ntR.")
     (tmp_path / "class" / "notes.md").write_text("not a table")
-    (tmp_path / "class" / "hf.pkl").write_bytes(
-        pickle.dumps({"env_id": "Taxi-v3", "qtable": planned(LAKE)})
-    )
+    named = {"env_id": "Taxi-v3", "qtable": planned(LAKE)}
+    (tmp_path / "class" / "hf.pkl").write_bytes(pickle.dumps(named))
     words = ["--env", LAKE, "--table", "marks.csv", "--json", "marks.json"]
-    code, out, err = typed("yardstick", "rate", "class", *words)
-    assert (code, err) == (0, "")
+    out = typed.done("yardstick", "rate", "class", *words)
     assert "1 of 3 could not be rated" in out
     rows = (tmp_path / "marks.csv").read_text().splitlines()
     names = "deeper/zeros.npy", "evil.pkl", "hf.pkl"
@@ -234,12 +231,13 @@ def test_tables_need_no_pytorch_and_files_run_nothing(tmp_path, typed, monkeypat
     assert not (tmp_path / "mark").exists()
     assert max(map(len, out.splitlines())) <= 80
     (tmp_path / "own.py").write_text("policy = lambda state: 2\nright = lambda obs: 1\n")
-    code, out, _ = typed("yardstick", "rate", "own.py:policy", "--env", LAKE)
-    assert (code, "score 0 " in out, "standard error" in out) == (0, True, False)
+    out = typed.done("yardstick", "rate", "own.py:policy", "--env", LAKE)
+    assert ("score 0 " in out, "standard error" in out) == (True, False)
     assert "its own code ran" in out
-    assert "standard error 0.0" in typed("yardstick", "rate", "own.py:right", "--env", POLE)[1]
-    _, _, err = typed("yardstick", "rate", "own.py:value", "--env", LAKE)
-    assert "own.py has no 'value'" in err
+    told = typed.done("yardstick", "rate", "own.py:right", "--env", POLE)
+    assert "standard error 0.0" in told
+    refusal = typed.refused("yardstick", "rate", "own.py:value", "--env", LAKE)
+    assert "own.py has no 'value'" in refusal
     sys.modules.pop("own", None)
     light = f"import numpy, sys\nfrom rl_yardstick import rate\nrate(numpy.eye(16, 4), '{LAKE}')"
     code = f"{light}\nsys.exit('torch' in sys.modules)"

@@ -24,26 +24,16 @@ def estimate(point, low=None, high=None, n=20):
 
 def agent(label, mean, **changes):
     """An agent whose figures are the mean plus 1, 2, 3 and so on, so that none is another."""
-    share = estimate(0.75, 0.5, 0.9, n=4)
-    ends = (0.0, 1.0)
-    figures = AgentAnalysis(
-        agent=label,
-        runs=AgentRuns("lake", label, 4, 0, mean / 100, ends, mean / 100, 0, ends, 0.5),
-        spread=0.0,
-        n_runs=4,
-        n_missing=0,
-        metric=Summary(estimate(mean), estimate(mean + 1), mean + 2),
-        score=estimate(mean / 100),
-        final=estimate(mean + 3),
-        last_episodes=estimate(mean + 5),
-        regret=estimate(mean + 6),
-        steps_to_threshold=ThresholdSummary(estimate(mean + 7), share),
-        episodes_to_stay=ThresholdSummary(estimate(mean + 8), share),
-        steps_to_stay=ThresholdSummary(estimate(mean + 10), share),
-        success_rate=estimate(0.5, 0.25, 0.625),
-        seconds=estimate(mean + 9),
-    )
-    return replace(figures, **changes)
+    share, ends = estimate(0.75, 0.5, 0.9, n=4), (0.0, 1.0)
+    runs = AgentRuns("lake", label, 4, 0, mean / 100, ends, mean / 100, 0, ends, 0.5)
+    figures = {"agent": label, "runs": runs, "spread": 0.0, "n_runs": 4, "n_missing": 0}
+    figures |= {"metric": Summary(estimate(mean), estimate(mean + 1), mean + 2)}
+    figures |= {"score": estimate(mean / 100), "success_rate": estimate(0.5, 0.25, 0.625)}
+    more = {"final": 3, "last_episodes": 5, "regret": 6, "seconds": 9}
+    figures |= {name: estimate(mean + n) for name, n in more.items()}
+    times = {"steps_to_threshold": 7, "episodes_to_stay": 8, "steps_to_stay": 10}
+    figures |= {name: ThresholdSummary(estimate(mean + n), share) for name, n in times.items()}
+    return AgentAnalysis(**{**figures, **changes})
 
 
 def failing(one, n_failed, n):
@@ -58,22 +48,10 @@ def pair(first, second, word, difference=0.1, **changes):
 
 
 def environment(agents=(), label="lake", **changes):
-    known = EnvironmentAnalysis(
-        environment=label,
-        env_id="Lake-v0",
-        optimum=100.0,
-        baseline=20.0,
-        threshold=96.0,
-        is_score=True,
-        margin=0.02,
-        bounds=(0.0, 100.0),
-        exact=True,
-        agents=tuple(agents),
-        pairs=(),
-        best=Best((), False, False),
-        failure_threshold=0.4,
-    )
-    return replace(known, **changes)
+    known = {"env_id": "Lake-v0", "optimum": 100.0, "baseline": 20.0, "threshold": 96.0}
+    known |= {"is_score": True, "margin": 0.02, "bounds": (0.0, 100.0), "exact": True}
+    known |= {"pairs": (), "best": Best((), False, False), "failure_threshold": 0.4}
+    return EnvironmentAnalysis(environment=label, agents=tuple(agents), **{**known, **changes})
 
 
 def study(labels, metric="final", places=("lake",), n_seeds=4):

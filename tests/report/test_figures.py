@@ -12,33 +12,20 @@ from matplotlib.colors import to_hex
 from matplotlib.ticker import EngFormatter, FixedLocator, PercentFormatter
 
 from rl_yardstick.experiments.analysis import OverallAnalysis
+from rl_yardstick.report import series
 from rl_yardstick.report.figures import write_figures
-from rl_yardstick.report.series import (
-    COLOURS,
-    ArmSeries,
-    Belief,
-    Curve,
-    EnvironmentSeries,
-    Grid,
-    LearningCurves,
-    PullSeries,
-    RegretBounds,
-    StudySeries,
-    Sweep,
-    agent_marks,
-)
 from tests.report import made_up
 
 GREY = "#595959"
-NAMED = {**dict(zip(COLOURS, ("blue", "red", "green"), strict=False)), GREY: "grey"}
+NAMED = {**dict(zip(series.COLOURS, ("blue", "red", "green"), strict=False)), GREY: "grey"}
 THIRD = np.array([0.0, 0.5, 1.0])
 PULLS = np.array([1, 10, 100])
-BOUNDS = RegretBounds(PULLS, np.array([10.0, 30.0, 90.0]), np.array([0.0, 5.0, 10.0]))
+BOUNDS = series.RegretBounds(PULLS, np.array([10.0, 30.0, 90.0]), np.array([0.0, 5.0, 10.0]))
 
 
 def curve(x, y):
     x, y = np.array(x, dtype=float), np.array(y, dtype=float)
-    return Curve(x, y, y - 1, y + 2)
+    return series.Curve(x, y, y - 1, y + 2)
 
 
 def curves_of(names, linear_up_to=None, on_variant=()):
@@ -47,8 +34,8 @@ def curves_of(names, linear_up_to=None, on_variant=()):
     episodes = {name: curve([1, 2][n == 1 :], [7, 8][n == 1 :]) for n, name in enumerate(names)}
     nothing = {names[0]: curve([1, 2], [-1, -2])}  # on an axis that is not drawn
     return {
-        "evaluation": LearningCurves({"step": steps, "episode": nothing}, linear_up_to),
-        "training": LearningCurves({"step": nothing, "episode": episodes}, None, on_variant),
+        "evaluation": series.LearningCurves({"step": steps, "episode": nothing}, linear_up_to),
+        "training": series.LearningCurves({"step": nothing, "episode": episodes}, None, on_variant),
     }
 
 
@@ -63,14 +50,15 @@ def whole_study(root, names, label, linear_up_to=None, on_variant=()):
     agents = tuple(made_up.agent(name, 90.0 - 50 * n) for n, name in enumerate(names))
     lake = made_up.environment(agents, label, values=runs_of(names))
     coins = made_up.environment(agents, "coins")
-    labels = (names * 3)[:3]
+    first, second = names[:2]
     swept = {
-        labels[0]: Sweep("α", curve([0.01, 0.1, 0.9], [30, 90, 3]), (labels[1], labels[0], "-")),
-        labels[1]: Sweep("γ", curve([0.9, 0.95, 1], [1, 2, 3]), ("-", "-", "-")),
+        first: series.Sweep("α", curve([0.01, 0.1, 0.9], [30, 90, 3]), (second, first, "-")),
+        second: series.Sweep("γ", curve([0.9, 0.95, 1], [1, 2, 3]), ("-", "-", "-")),
     }
     means = np.array([[90.0, 30.0], [40.0, np.nan]])
-    grid = Grid(("γ", "kind"), ["1", "2"], labels[:2], means, [[labels[0], "-"], [labels[1], ""]])
-    arms = ArmSeries(
+    cells = [[first, "-"], [second, ""]]
+    grid = series.Grid(("γ", "kind"), ["1", "2"], names[:2], means, cells)
+    arms = series.ArmSeries(
         [f"context {context}, arm {arm}" for context in (0, 1) for arm in (0, 1)],
         np.array([0.1, 0.2, 0.3, 0.4]),
         {name: np.array([0.25, 0.75, 0.5, 0.5]) for name in names},
@@ -78,17 +66,19 @@ def whole_study(root, names, label, linear_up_to=None, on_variant=()):
     )
     # The densities count up: by context, arm and point.
     densities = np.arange(12.0).reshape(1, 2, 2, 3)
-    belief = Belief(names[1], np.array([2000]), THIRD, densities, [[0.25, 0.75], [None, 0.5]])
+    true_means = [[0.25, 0.75], [None, 0.5]]
+    belief = series.Belief(names[1], np.array([2000]), THIRD, densities, true_means)
     pulls = {name: made_up.pulls(10.0 + 40 * n) for n, name in enumerate(names)}
+    of_coins = series.PullSeries(pulls, 75.0, BOUNDS, arms, (belief,))
     profiles = dict.fromkeys(names, 1 - THIRD)
     overall = OverallAnalysis({}, (), None, THIRD, profiles)
     learnt = curves_of(names, linear_up_to, on_variant)
     places = (
-        EnvironmentSeries(lake, learnt, None, swept, {"swept": grid}),
-        EnvironmentSeries(coins, None, PullSeries(pulls, 75.0, BOUNDS, arms, (belief,)), {}),
+        series.EnvironmentSeries(lake, learnt, None, swept, {"swept": grid}),
+        series.EnvironmentSeries(coins, None, of_coins, {}),
     )
     found = made_up.analysis([lake, coins], names[::-1], root, overall=overall)
-    return StudySeries(found, agent_marks(found.study), places)
+    return series.StudySeries(found, series.agent_marks(found.study), places)
 
 
 @pytest.fixture
@@ -159,9 +149,8 @@ def described(figure):
         x, y = axis_words(axes.xaxis, axes.get_xscale()), axis_words(axes.yaxis, axes.get_yscale())
         shown += [words for words in (x, y) if words]
         shown += [*map(line_words, axes.get_lines())]
-        shown += [
-            area_words(found) for found in axes.collections if not isinstance(found, QuadMesh)
-        ]
+        areas = [found for found in axes.collections if not isinstance(found, QuadMesh)]
+        shown += map(area_words, areas)
         for kind, found in groupby(axes.patches, patch_words):
             shown.append(" ".join([kind, *(point(*patch.get_center()) for patch in found)]))
         if axes.texts:

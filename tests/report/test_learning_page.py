@@ -34,9 +34,8 @@ def page_of(tmp_path):
 
 def test_the_data_are_what_was_recorded_to_the_last_digit(watched, page_of):
     values = np.array([0.1 + 0.2, 1e-300, -2.0, np.nan, np.inf, 123456789.123456789])
-    assert json.loads(as_json({"values": values}, exactly)) == {
-        "values": [0.30000000000000004, 1e-300, -2, None, "Infinity", 123456789.12345679]
-    }
+    expected = [0.30000000000000004, 1e-300, -2, None, "Infinity", 123456789.12345679]
+    assert json.loads(as_json({"values": values}, exactly)) == {"values": expected}
     maps = {"env_kwargs": {"desc": ["S.G"]}, "train_env_kwargs": {"desc": ["S..", "#.G"]}}
     spec, watch = watched("Warehouse-v0", "qlearning", {"n_timesteps": 200, **maps})
     data, _ = page_of(spec, watch)

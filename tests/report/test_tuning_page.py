@@ -8,15 +8,8 @@ import optuna
 import pytest
 import yaml
 
+from rl_yardstick.report.page import tuning as tuning_page
 from rl_yardstick.report.page.frame import as_json
-from rl_yardstick.report.page.tuning import (
-    Trials,
-    changes,
-    cost,
-    history,
-    importances,
-    write_tuning_page,
-)
 from tests.report import made_up
 
 SAID = yaml.safe_load(Path(__file__).with_name("tuning_page.yml").read_text(encoding="utf-8"))
@@ -24,7 +17,7 @@ SAID = yaml.safe_load(Path(__file__).with_name("tuning_page.yml").read_text(enco
 
 def shown_of(record):
     """The history as the page has it."""
-    return json.loads(as_json(history(Trials(record))))
+    return json.loads(as_json(tuning_page.history(tuning_page.Trials(record))))
 
 
 def test_the_history_has_the_best_of_those_with_all_seeds():
@@ -49,32 +42,32 @@ def test_trials_are_ranked_by_value_and_those_with_the_optimum_by_their_steps():
         ({"lower_is_better": True}, [0, 3, 2, 1, 4, 6]),
         ({"trials": trials}, [3, 1, 0, 2]),
     ):
-        found = Trials({**made_up.tuning(), **fields}).best_first
+        found = tuning_page.Trials({**made_up.tuning(), **fields}).best_first
         assert [trial["number"] for trial in found] == ranked
 
 
 def test_the_parameter_that_decides_matters_most():
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(0))
-    space = Trials(made_up.tuning()).distributions
+    space = tuning_page.Trials(made_up.tuning()).distributions
     drawn = enumerate(study.ask(space).params for _ in range(60))
     trials = [made_up.trial(n, -abs(each["steps"] - 3), {"1": 0.0}, **each) for n, each in drawn]
-    shares = importances(Trials({**made_up.tuning(), "trials": trials}))
+    shares = tuning_page.importances(tuning_page.Trials({**made_up.tuning(), "trials": trials}))
     assert next(iter(shares)) == "steps"
     assert shares["steps"] > 0.7
     assert sum(shares.values()) == pytest.approx(1.0)
 
 
 def test_tables_have_the_cost_and_what_changed():
-    trials = Trials(made_up.tuning())
-    assert cost(trials) == [*SAID["cost"].items()]
-    assert changes(trials, 2) == [("learning_rate", "0", "2"), ("tau", "-", "1.0")]
+    trials = tuning_page.Trials(made_up.tuning())
+    assert tuning_page.cost(trials) == [*SAID["cost"].items()]
+    assert tuning_page.changes(trials, 2) == [("learning_rate", "0", "2"), ("tau", "-", "1.0")]
 
 
 def test_the_page_is_one_file_that_says_what_won(tmp_path):
     def page(**changes):
         path = tmp_path / "report.html"
         record, command = made_up.tuning() | changes, "python train.py --conf-file winner.yml"
-        write_tuning_page(record, path, "retest/report.html", command)
+        tuning_page.write_tuning_page(record, path, "retest/report.html", command)
         text = path.read_text(encoding="utf-8")
         return text, re.findall(r'<section id="(\w+)"', text)
 

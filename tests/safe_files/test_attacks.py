@@ -27,6 +27,7 @@ from rl_yardstick.safe_files.files import UnsafeFileError, first_look
 from rl_yardstick.safe_files.known_objects import load_tensors, read_pickle
 from rl_yardstick.safe_files.models import inspect_model, load_model
 from rl_yardstick.safe_files.pickles import INSTRUCTIONS
+from rl_yardstick.safe_files.tables import read_table_file
 
 UTILS = "stable_baselines3.common.utils"
 START = b"\x80\x04"
@@ -104,6 +105,9 @@ ATTACKS = {attack: START + instructions + b"." for attack, instructions in ATTAC
     "a name as a set": START + name("os", "environ") + b"(N\x90.",
     "an array of objects": pickle.dumps(np.array([print], dtype=object)),
     "a whole number of thousands of digits": pickle.dumps(10**5000),
+    "an instance": b"(Vmkdir mark\nios\nsystem\n.",
+    "a call of eval": b"cbuiltins\neval\n(Vopen('mark', 'w')\ntR.",
+    "a dictionary that holds itself": START + b"}\x94K\1h\0s.",
 }
 
 
@@ -131,11 +135,14 @@ def loaders(genuine):
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_attacks_by_pickle_are_refused(attack, loaders):
+def test_attacks_by_pickle_are_refused(attack, loaders, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     tracemalloc.start()
     try:
-        with pytest.raises(UnsafeFileError):
-            read_pickle(ATTACKS[attack])
+        for read in (read_pickle, lambda content: read_table_file(io.BytesIO(content))):
+            with pytest.raises(UnsafeFileError) as refusal:
+                read(ATTACKS[attack])
+            assert str(refusal.value).isprintable()
         assert tracemalloc.get_traced_memory()[1] < 70e6
     finally:
         tracemalloc.stop()
@@ -144,6 +151,7 @@ def test_attacks_by_pickle_are_refused(attack, loaders):
             read(ATTACKS[attack])
         assert str(refusal.value).isprintable(), loader
     assert ConstantSchedule(0.5)(1.0) == 0.5
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_no_other_instruction_makes_or_fetches_anything():

@@ -23,37 +23,22 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch import nn, optim
 
 from rl_yardstick.envs.wrappers import ActionMasks
-from rl_yardstick.safe_files.buffers_and_statistics import (
-    load_replay_buffer,
-    load_vec_normalize,
-    read_normalization,
-)
+from rl_yardstick.safe_files import buffers_and_statistics as loaders
 from rl_yardstick.safe_files.files import UnsafeFileError
 from rl_yardstick.safe_files.models import inspect_model, load_model
 
 FOLDER = Path(__file__).parent / "old_models"
-
-
 FEW = {"learning_starts": 10, "buffer_size": 200, "batch_size": 8}
 ROLLOUT = {"n_steps": 32, "batch_size": 16}
 NOISE = np.zeros(1), np.full(1, 0.1)
 
-SCHEDULES = {
-    "learning_rate": LinearSchedule(1e-3, 0.0, 1.0),
-    "clip_range": LinearSchedule(0.2, 0.1, 0.5),
-    "clip_range_vf": 0.2,
-    "policy_kwargs": {
-        "net_arch": {"pi": [4], "vf": [4]},
-        "activation_fn": nn.ReLU,
-        "optimizer_class": optim.AdamW,
-        "optimizer_kwargs": {"weight_decay": 0.01},
-    },
-}
+NETWORKS = {"net_arch": {"pi": [4], "vf": [4]}, "activation_fn": nn.ReLU}
+NETWORKS |= {"optimizer_class": optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.01}}
+SCHEDULES = {"learning_rate": LinearSchedule(1e-3, 0.0, 1.0), "policy_kwargs": NETWORKS}
+SCHEDULES |= {"clip_range": LinearSchedule(0.2, 0.1, 0.5), "clip_range_vf": 0.2}
 STACKED = {"policy_kwargs": {"optimizer_class": RMSpropTFLike, "net_arch": [4]}}
-HINDSIGHT = {
-    "replay_buffer_class": sb3.HerReplayBuffer,
-    "replay_buffer_kwargs": {"n_sampled_goal": 2, "goal_selection_strategy": "future"},
-}
+GOALS = {"n_sampled_goal": 2, "goal_selection_strategy": "future"}
+HINDSIGHT = {"replay_buffer_class": sb3.HerReplayBuffer, "replay_buffer_kwargs": GOALS}
 LSTM = {"policy_kwargs": {"lstm_hidden_size": 4, "net_arch": [4]}}
 SDE = {"use_sde": True}
 
@@ -127,7 +112,7 @@ LIBRARY = (
     lambda model, path: model.load_replay_buffer(path),
     VecNormalize.load,
 )
-OURS = load_model, load_replay_buffer, load_vec_normalize
+OURS = load_model, loaders.load_replay_buffer, loaders.load_vec_normalize
 
 
 # What the library says when it loads such models, by its own function too.
@@ -158,11 +143,11 @@ def test_statistics_keep_their_settings_and_are_refused_elsewhere(tmp_path):
     path, flags = str(tmp_path / "statistics.pkl"), {"training": False, "norm_reward": False}
     made = VecNormalize(make_vec_env(CART), **flags, clip_obs=3.0, clip_reward=4.0, gamma=0.9)
     made.save(path)
-    found = load_vec_normalize(path, make_vec_env(CART))
+    found = loaders.load_vec_normalize(path, make_vec_env(CART))
     for name in ("norm_obs", *flags, "clip_obs", "clip_reward", "gamma", "epsilon"):
         assert getattr(found, name) == getattr(made, name), name
     with pytest.raises(UnsafeFileError, match=r"holds statistics of Box.*, not of Box"):
-        load_vec_normalize(path, make_vec_env(SWING))
+        loaders.load_vec_normalize(path, make_vec_env(SWING))
 
 
 # Made by these versions: those that are seeded have generators as NumPy 1 pickles them. What they
@@ -197,7 +182,7 @@ def test_models_of_older_versions_are_loaded_with_other_schedules(name):
 
 def test_a_generator_of_numpy_1_goes_on():
     with (FOLDER / "vecnormalize_seeded_2.6.0.pkl").open("rb") as file:
-        saved = read_normalization(file.read()).observation_space
+        saved = loaders.read_normalization(file.read()).observation_space
     fresh = gym.make(CART).observation_space
     fresh.seed(0)
     assert saved == fresh

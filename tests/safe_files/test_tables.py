@@ -3,7 +3,6 @@
 import collections
 import io
 import json
-import os
 import pickle
 import tracemalloc
 from functools import partial
@@ -14,6 +13,7 @@ import torch as th
 
 from rl_yardstick.safe_files.files import Budget, UnsafeFileError
 from rl_yardstick.safe_files.tables import read_pickled_table, read_table_file
+from tests.safe_files.test_attacks import Attack
 
 VALUES = np.arange(12.0).reshape(4, 3)
 
@@ -22,7 +22,7 @@ def pairs():
     return {(state, action): VALUES[state, action] for state in range(4) for action in range(3)}
 
 
-by_state = dict(enumerate(VALUES))
+by_state, OF_A_COURSE = dict(enumerate(VALUES)), {"env_id": "Taxi-v4", "qtable": VALUES}
 FORMS = {
     "an array": (VALUES, VALUES),
     "of another order and precision": (np.asfortranarray(VALUES, np.float32), VALUES),
@@ -36,10 +36,7 @@ FORMS = {
     "hands": ({(14, 10, False): [0.5, 1]}, {(14, 10, False): [0.5, 1]}),
     "numbers of NumPy": ({(np.int64(1), np.bool_(True)): np.float64(2)}, {(1, True): 2.0}),
     "texts": ({"(1, 2)": [0.5]}, {"(1, 2)": [0.5]}),
-    "of a course": (
-        {"env_id": "Taxi-v4", "qtable": VALUES},
-        {"env_id": "Taxi-v4", "qtable": VALUES},
-    ),
+    "of a course": (OF_A_COURSE, OF_A_COURSE),
 }
 
 
@@ -68,42 +65,16 @@ def test_a_counter_of_another_module():
     assert same(read_pickled_table(content, Budget(len(content))), pairs())
 
 
-class Mark:
-    def __reduce__(self):
-        return os.mkdir, ("mark",)
-
-
-def bomb(layers=60):
-    """A tuple of a tuple of ... that has 2**layers leaves, as the key of a dictionary."""
-    made = b"N\x940" + b"".join(b"h%ch%c\x86\x940" % (i, i) for i in range(layers))
-    return b"\x80\x04" + made + b"}h%cK\x01s." % layers
-
-
 def huge_header(shape):
-    written = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        written, {"descr": "<f8", "fortran_order": False, "shape": shape}
-    )
+    written, header = io.BytesIO(), {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(written, header)
     return written.getvalue() + bytes(80)
 
 
-ATTACKS = {
-    "a call": pickle.dumps(Mark()),
-    "a call of protocol 0": pickle.dumps(Mark(), protocol=0),
-    "eval": b"cbuiltins\neval\n(Vopen('mark', 'w')\ntR.",
-    "in a table": pickle.dumps({0: [1.0, Mark()]}),
-    "as a default": pickle.dumps({(0, Mark()): 1.0}),
-    "a class of its own": b"cos\nsystem\n.",
-    "INST": b"(Vmkdir mark\nios\nsystem\n.",
-    "a bomb": bomb(),
-    "lists in lists": b"]" * 5000 + b"a" * 4999 + b".",
-    "a dictionary that holds itself": b"\x80\x04}\x94K\x01h\x00s.",
-    "a length that is not there": b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7f.",
-    "a number of megabytes": b"\x80\x04\x8b"
-    + (10**6).to_bytes(4, "little")
-    + b"\x7f" * 10**6
-    + b".",
-    "an odd dictionary": b"(I1\nd.",
+ATTACKS = {  # more than `test_attacks.py` has, which tries its own here too
+    "a call": pickle.dumps(Attack("mark")),
+    "in a table": pickle.dumps({0: [1.0, Attack("mark")]}),
+    "as a default": pickle.dumps({(0, Attack("mark")): 1.0}),
     "an array of petabytes": huge_header((1 << 40, 1 << 10)),
     "a shape below zero": huge_header((-1, 4)),
     "nothing": b" \n",

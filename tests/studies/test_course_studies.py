@@ -21,9 +21,8 @@ from rl_yardstick.pipeline.components import constructor_arguments
 
 ROOT = Path(__file__).parents[2]
 # Bandits have a guide of their own.
-STUDIES = [
-    path for path in sorted((ROOT / "studies").glob("*.yml")) if not path.name.startswith("bandit-")
-]
+FILES = sorted((ROOT / "studies").glob("*.yml"))
+STUDIES = [path for path in FILES if not path.name.startswith("bandit-")]
 GUIDE = "".join((ROOT / "docs" / name).read_text() for name in ("courses.md", "tutorials.md"))
 
 

@@ -14,18 +14,6 @@ from rl_yardstick.experiments.results import RunResults
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.settings import read_entry, read_yaml, seeds_tuned_on
 from rl_yardstick.tuning import retesting, searching
-from rl_yardstick.tuning.retesting import (
-    Outcome,
-    Retested,
-    best_trials,
-    chosen_for_retest,
-    concluded,
-    entry_text,
-    is_settled,
-    label_of,
-    retest_study,
-    write_winner,
-)
 from rl_yardstick.tuning.searching import (
     FAILURE,
     RUNS,
@@ -100,7 +88,7 @@ def test_a_saturated_search_ends_and_ranks_by_steps_to_the_threshold(toy, retest
     optimal = [trial for trial in trials if trial.user_attrs[SETTINGS]["gamma"] >= 0.7]
     assert (search.n_at_optimum, len(optimal), optimal[-1] == trials[-1]) == (n, n, True)
     assert len(trials) < 40
-    ranked = best_trials(tuning, trials)
+    ranked = retesting.best_trials(tuning, trials)
     rates = [each.user_attrs[SETTINGS]["learning_rate"] for each in ranked]
     assert rates[:n] == sorted(rates[:n])
     assert not toy.search(toy.opened(tuning), score=figures[0], steps=figures[1])
@@ -139,7 +127,7 @@ def test_trials_with_equal_settings_share_their_runs(toy):
     search = toy.opened(toy.tuning(sampler="random"))
     assert len(toy.search(search, n_workers=4)) == 6
     assert states(search) == ["COMPLETE"] * 10
-    assert len(best_trials(search.tuning, search.trials)) == 2
+    assert len(retesting.best_trials(search.tuning, search.trials)) == 2
 
 
 def test_what_the_user_fixes_is_not_searched(toy):
@@ -233,17 +221,18 @@ def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):
     search = toy.opened()
     toy.search(search)
     tuning = search.tuning
-    ranked = best_trials(tuning, search.trials)
+    ranked = retesting.best_trials(tuning, search.trials)
     values = [each.value for each in ranked]
     assert values == sorted(values, reverse=True)
-    twice = best_trials(tuning, [*search.trials, *search.trials])
+    twice = retesting.best_trials(tuning, [*search.trials, *search.trials])
     assert [each.number for each in twice] == [each.number for each in ranked]
-    chosen = chosen_for_retest(tuning, ranked)
+    chosen = retesting.chosen_for_retest(tuning, ranked)
     assert len(chosen) == 3
     assert all(each.number for each in chosen)
-    study = retest_study(tuning, tmp_path, chosen)
+    study = retesting.retest_study(tuning, tmp_path, chosen)
     assert list(study.seeds) == list(range(1000, 1020))
-    assert [agent.label for agent in study.agents] == ["shipped", *[label_of(e) for e in chosen]]
+    labels = ["shipped", *map(retesting.label_of, chosen)]
+    assert [agent.label for agent in study.agents] == labels
     for agent, each in zip(study.agents[1:], chosen, strict=True):
         entry = read_entry("qlearning", "FrozenLake-v1", agent.conf_file)
         assert entry == each.user_attrs[SETTINGS]
@@ -270,7 +259,8 @@ def complete_trial(number, entry, figures):
 def test_settings_clearly_below_the_shipped_ones_are_not_run_again(toy, figures, is_below):
     def chosen(figure, *others):
         found = [complete_trial(n, {}, each) for n, each in enumerate(others) if each]
-        return [each.number for each in chosen_for_retest(toy.tuning(figure=figure), found)]
+        kept = retesting.chosen_for_retest(toy.tuning(figure=figure), found)
+        return [each.number for each in kept]
 
     shipped, there = (0.7, 0.8, 0.9), [1][is_below:]
     assert chosen("score", shipped, figures) == there
@@ -295,7 +285,7 @@ def runs_of_retest(toy, root, runs, **changes):
     tuning = toy.tuning(retest_seeds=len(runs["shipped"]), **changes)
     labels = [label for label in runs if label != "shipped"]
     found = [complete_trial(int(label[-1]), ENTRY, [0.5]) for label in labels]
-    study = retest_study(tuning, root, found)
+    study = retesting.retest_study(tuning, root, found)
     ends = {label: [s if s is None else 100 * s for s in scores] for label, scores in runs.items()}
     return tuning, found, results_of(study, root, ends)
 
@@ -306,7 +296,7 @@ def re_tested(toy, root, monkeypatch, runs, figures=None, **changes):
     told = figures or runs
     outcome = lambda _, run: RunOutcome(told[run.agent][run.seed - 1000], 1.0, "score")  # noqa: E731
     monkeypatch.setattr(retesting, "outcome_of", outcome)
-    return concluded(tuning, found, found, analyse(results))
+    return retesting.concluded(tuning, found, found, analyse(results))
 
 
 HALF = [0.0, 1.0] * 10
@@ -352,7 +342,7 @@ def test_a_re_test_has_grown_enough_when_its_best_setting_is_decided(
     words = {(pair.first, pair.second): pair.word for pair in said.pairs}
     expected = "undecided" if first == OLD else "worse"
     assert words == {("shipped", "trial 1"): expected, ("shipped", "trial 2"): "undecided"}
-    assert is_settled(said) == settled
+    assert retesting.is_settled(said) == settled
 
 
 @pytest.mark.parametrize(
@@ -382,7 +372,7 @@ def test_an_entry_is_read_as_it_was_with_the_seeds_that_it_has_seen(toy, tmp_pat
     path, tuning = tmp_path / "found.yml", toy.tuning(n_seeds=12)
     shipped = replace(tuning.agent, conf_file=None)
     tuning = replace(tuning, study=replace(tuning.study, agents=(shipped,)))
-    path.write_text(entry_text(tuning, ENTRY, "found: somewhere"))
+    path.write_text(retesting.entry_text(tuning, ENTRY, "found: somewhere"))
     assert read_entry("qlearning", "FrozenLake-v1", path) == ENTRY
     assert seeds_tuned_on("qlearning", "FrozenLake-v1", path) == (range(10), range(12))
     assert "\n# found: somewhere\nFrozenLake-v1:\n  policy: MlpPolicy\n" in path.read_text()
@@ -391,20 +381,18 @@ def test_an_entry_is_read_as_it_was_with_the_seeds_that_it_has_seen(toy, tmp_pat
 def test_the_file_of_the_winner_says_where_it_comes_from(toy):
     search = toy.opened()
     toy.search(search)
+    rows = ("shipped", 0, 0.7, ""), ("trial 4", 4, 0.85, "better")
     shipped, winner = (
-        Retested(label, number, 0.9, held_out, Estimate(held_out, 0.5, 0.9, 20), verdict, 20, 0)
-        for label, number, held_out, verdict in (
-            ("shipped", 0, 0.7, ""),
-            ("trial 4", 4, 0.85, "better"),
-        )
+        retesting.Retested(label, n, 0.9, mean, Estimate(mean, 0.5, 0.9, 20), verdict, 20, 0)
+        for label, n, mean, verdict in rows
     )
-    outcome = Outcome((shipped, winner), winner, "", 0.05, range(1000, 1020))
-    path = write_winner(search, outcome)
+    outcome = retesting.Outcome((shipped, winner), winner, "", 0.05, range(1000, 1020))
+    path = retesting.write_winner(search, outcome)
     assert read_entry("qlearning", "FrozenLake-v1", path) == search.trials[4].user_attrs[SETTINGS]
     said = " ".join(line[2:] for line in path.read_text().splitlines() if line.startswith("# "))
     assert "trial 4 of 10 (tpe), mean of score over the seeds 0 to 2: 0.9." in said
     assert "On the seeds 1000 to 1019, which the search has not seen: 0.85 (20 runs)" in said
     assert "the settings before, there: 0.7" in said
     assert said.endswith("Verdict on means: better.")
-    assert write_winner(search, replace(outcome, winner=None)) is None
+    assert retesting.write_winner(search, replace(outcome, winner=None)) is None
     assert not path.exists()
