@@ -407,8 +407,7 @@ def moments_under_limit(
         changed = False
         for state in range(prob.shape[0]):
             outcomes = (prob[state], next_state[state], terminated[state], reward[state])
-            _means(outcomes, success[state], chances[state], discount, later, now[state])
-            _variances(outcomes, chances[state], discount, later, now[state])
+            _moments(outcomes, success[state], chances[state], discount, later, now[state])
             for moment in range(5):
                 changed = changed or now[state, moment] != later[state, moment]
         now, later = later, now
@@ -419,14 +418,13 @@ def moments_under_limit(
 
 
 @called
-def _means(
+def _moments(
     model: Dynamics, success: Bools, chances: Floats, discount: float, later: Floats, now: Floats
 ) -> None:
-    """The means of one state, from its rows of the model and the moments one step later."""
+    """The moments of one state, from its rows of the model and the moments one step later."""
     prob, next_state, terminated, reward = model
-    now[0] = 0.0
+    now[:] = 0.0
     now[2] = 1.0
-    now[4] = 0.0
     for action in range(prob.shape[0]):
         for k in range(prob.shape[1]):
             weight = chances[action] * prob[action, k]
@@ -438,16 +436,7 @@ def _means(
                     now[0] += weight * discount * after[0]
                     now[2] += weight * after[2]
                     now[4] += weight * after[4]
-
-
-@called
-def _variances(
-    model: Dynamics, chances: Floats, discount: float, later: Floats, now: Floats
-) -> None:
-    """The variances of one state, by the law of total variance."""
-    prob, next_state, terminated, reward = model
-    now[1] = 0.0
-    now[3] = 0.0
+    # The law of total variance.
     for action in range(prob.shape[0]):
         for k in range(prob.shape[1]):
             weight = chances[action] * prob[action, k]
