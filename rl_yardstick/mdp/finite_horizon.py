@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,23 +72,13 @@ def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None
     step_cost, fall, variance = drift(model, plan.values)
     slack = 4 * plan.error_bound  # error of differences of values, each within the bound
     overdue = horizon * step_cost - (highest - lowest_start) - slack
-    fall, deviation = fall + slack, math.sqrt(variance) + slack
+    loss, fall, deviation = overdue + lowest - slack, fall + slack, math.sqrt(variance) + slack
     chance = 1.0
-    if step_cost > 0:
-        chance = chance_of_losing(overdue + lowest - slack, fall, deviation**2, horizon)
+    if step_cost > 0 and loss > 0:
+        scale = 2 * horizon * deviation**2 + 2 * fall * loss / 3
+        chance = math.exp(-(loss**2) / scale) if scale > 0 else 0.0
     error = plan.error_bound + max(-lowest, highest) * chance
     return plan.start_value if error <= TOLERANCE * max(1.0, abs(plan.start_value)) else None
-
-
-def chance_of_losing(loss: float, fall: float, variance: float, horizon: int) -> float:
-    """A bound on the probability that ``horizon`` steps lose ``loss`` by chance alone.
-
-    ``variance`` bounds that of the value after a step, ``fall`` how far it falls below its mean.
-    """
-    if loss <= 0:
-        return 1.0
-    scale = 2 * horizon * variance + 2 * fall * loss / 3
-    return math.exp(-(loss**2) / scale) if scale > 0 else 0.0
 
 
 def drift(model: TransitionModel, values: Floats) -> tuple[float, float, float]:
@@ -347,7 +338,6 @@ def finite_horizon_optimum(
 ) -> FiniteHorizonPlan:
     """Plan backwards from the time limit.
 
-    Stops once a step changes no value in its last bit: further steps would change none either.
     Sutton and Barto, Reinforcement Learning, 2nd edition, chapter 4; Puterman, Markov
     Decision Processes, 1994, section 4.5.
 
@@ -358,19 +348,31 @@ def finite_horizon_optimum(
         raise ValueError(f"horizon is {horizon}, it must be at least 1")
     if not 0 <= discount <= 1:
         raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
-    states = np.flatnonzero(model.reachable)
-    allowed = model.allowed_actions(mask)
-    values = np.zeros(model.n_states)
     rows: list[Actions] = []
-    for _ in range(horizon):
-        earlier = np.zeros(model.n_states)
-        actions = np.zeros(model.n_states, np.min_scalar_type(model.n_actions - 1))
-        back_up(model.dynamics, allowed, float(discount), states, values, earlier, actions)
-        rows.append(actions)
-        if np.array_equal(earlier, values):
-            break
+    values = np.zeros(model.n_states)
+    for earlier, actions in backwards(model, horizon, discount, mask):
         values = earlier
+        rows.append(actions)
     return FiniteHorizonPlan(values, np.array(rows), horizon, float(model.initial @ values))
+
+
+def backwards(
+    model: TransitionModel, horizon: int, discount: float = 1.0, mask: Bools | None = None
+) -> Iterator[tuple[Floats, Actions]]:
+    """Optimal values and actions with 1, 2, ... steps left, each of shape (S,).
+
+    Stops once a step changes no value in its last bit: further steps would change none either.
+    """
+    states, allowed = np.flatnonzero(model.reachable), model.allowed_actions(mask)
+    later = np.zeros(model.n_states)
+    for _ in range(horizon):
+        values = np.zeros(model.n_states)
+        actions = np.zeros(model.n_states, np.min_scalar_type(model.n_actions - 1))
+        back_up(model.dynamics, allowed, float(discount), states, later, values, actions)
+        yield values, actions
+        if np.array_equal(values, later):
+            return
+        later = values
 
 
 @compiled

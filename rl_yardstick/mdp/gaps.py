@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rl_yardstick.machine_code.compiling import called, compiled
+from rl_yardstick.machine_code.compiling import compiled
 from rl_yardstick.mdp.evaluation import Policy, canonical_policy, chances_in, policy_return
-from rl_yardstick.mdp.finite_horizon import back_up
+from rl_yardstick.mdp.finite_horizon import backwards
 from rl_yardstick.mdp.graph import PolicyChain
-from rl_yardstick.mdp.planning import action_value
+from rl_yardstick.mdp.planning import action_value, pass_on
 from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
 # The largest number of values to store over all steps, 8 bytes each.
@@ -187,15 +187,9 @@ def _optimal_rows(model: TransitionModel, horizon: int) -> Floats:
 
     With m steps or more left they are those of the last row.
     """
-    states = np.flatnonzero(model.reachable)
-    allowed = model.allowed_actions()
     rows = [np.zeros(model.n_states)]
-    for _ in range(horizon):
-        earlier, actions = np.zeros(model.n_states), np.zeros(model.n_states, np.uint64)
-        back_up(model.dynamics, allowed, 1.0, states, rows[-1], earlier, actions)
-        if np.array_equal(earlier, rows[-1]):
-            break
-        rows.append(earlier)
+    for values, _ in backwards(model, horizon):
+        rows.append(values)
         _check_size(len(rows), model)
     return np.array(rows)
 
@@ -307,18 +301,6 @@ def expected_estimates(
 # Compiled. With more steps left than there are rows of values, the last row applies.
 
 
-@called
-def _spread(model: Dynamics, state: int, action: int, weight: float, there: Floats) -> float:
-    """Move a state's probability to its successors in ``there``; returns the part that goes on."""
-    prob, next_state, terminated, _ = model
-    left = 0.0
-    for k in range(prob.shape[2]):
-        if prob[state, action, k] > 0 and not terminated[state, action, k]:
-            there[next_state[state, action, k]] += weight * prob[state, action, k]
-            left += weight * prob[state, action, k]
-    return left
-
-
 @compiled
 def _losses(
     model: Dynamics,
@@ -362,7 +344,7 @@ def _losses(
                 weight = here[state] * weights[action]
                 if weight > 0:
                     losses[state] += weight * max(now[state] - value, 0.0)
-                    goes_on += _spread(model, state, action, weight, there)
+                    goes_on += pass_on(model, state, action, weight, there)
         here = there
         if goes_on == 0:
             break

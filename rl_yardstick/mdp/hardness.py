@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rl_yardstick.machine_code.compiling import compiled
 from rl_yardstick.mdp.evaluation import (
     OPTIMAL_TOLERANCE,
     baseline_policies,
@@ -19,10 +20,10 @@ from rl_yardstick.mdp.evaluation import (
     policy_return,
     state_visitation,
 )
-from rl_yardstick.mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
+from rl_yardstick.mdp.finite_horizon import FiniteHorizonPlan, back_up, finite_horizon_optimum
 from rl_yardstick.mdp.graph import steps_to_end
-from rl_yardstick.mdp.planning import policy_iteration, surely_ending
-from rl_yardstick.mdp.transition_model import Bools, Floats, TransitionModel
+from rl_yardstick.mdp.planning import action_value, policy_iteration, surely_ending
+from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, TransitionModel
 
 # Above these limits, a measure is None. Outcomes of reachable states, times these states.
 MOST_FOR_DIAMETER = 5_000_000
@@ -231,9 +232,12 @@ def looking_ahead(model: TransitionModel, horizon: int) -> tuple[int | None, flo
         current[left] = model.action_values(current[left - 1]).mean(axis=1)
     is_random = ((model.prob > 0).sum(axis=2) > 1)[model.reachable].any()
     bounded = n_actions > 1 and not is_random and model.reward_variance is None
+    dynamics, start, states = model.dynamics, model.initial > 0, np.flatnonzero(model.reachable)
+    everything, actions = model.allowed_actions(), np.zeros(model.n_states, np.uint64)
     lookahead, bound = None, float(steps)
     for k in range(1, deepest + 1):
-        solves, spread = _greedy_is_optimal(model, best, worst, current)
+        rows = best, worst, current
+        solves, spread = _greedy_is_optimal(dynamics, start, *rows, OPTIMAL_TOLERANCE)
         if solves and lookahead is None:
             lookahead = k
         if bounded and np.isfinite(spread):
@@ -244,7 +248,8 @@ def looking_ahead(model: TransitionModel, horizon: int) -> tuple[int | None, flo
             break
         # A sweep of value iteration, in place: with each number of steps left from one step fewer.
         for left in range(steps, 0, -1):
-            current[left] = model.action_values(current[left - 1]).max(axis=1)
+            later, now = current[left - 1], current[left]
+            back_up(dynamics, everything, 1.0, states, later, now, actions)
     return lookahead, bound if bounded and lookahead is not None else None
 
 
@@ -258,31 +263,53 @@ def _longest_episode(model: TransitionModel, horizon: int) -> int:
     return horizon
 
 
+@compiled
 def _greedy_is_optimal(
-    model: TransitionModel, best: Floats, worst: Floats, current: Floats
+    model: Dynamics, start: Bools, best: Floats, worst: Floats, current: Floats, tolerance: float
 ) -> tuple[bool, float]:
     """Whether all greedy policies are optimal, and the largest (v + b d / 6) / d^2 for GORP.
 
     Q(k) follows from the state values ``current``. Greedy policies take the best actions; GORP may
     take each action that looks better than the best mistake, see `looking_ahead`.
     """
-    spread, greedy, likely = 0.0, model.initial > 0, model.initial > 0
+    prob, next_state, terminated, mean_reward = model
+    n_states, n_actions = mean_reward.shape
+    is_optimal, spread = True, 0.0
+    greedy, likely = start.copy(), start.copy()
+    seems, truly, lowest = np.empty(n_actions), np.empty(n_actions), np.empty(n_actions)
     for left in range(len(best) - 1, 0, -1):
-        rows = current[left - 1], best[left - 1], worst[left - 1]
-        seems, truly, lowest = map(model.action_values, rows)
-        least = best[left] - OPTIMAL_TOLERANCE * np.maximum(1.0, np.abs(best[left]))
-        top = seems.max(axis=1)
-        margin = OPTIMAL_TOLERANCE * np.maximum(1.0, np.abs(top))
-        mistake = np.where(truly < least[:, None], seems, -np.inf).max(axis=1)
-        is_close = top - mistake <= margin
-        if (is_close & (greedy | likely)).any():
-            spread = np.inf
-        if (is_close & greedy).any():
-            return False, spread
-        told = likely & ~is_close & (mistake > -np.inf)
-        gap, width = (top - mistake)[told, None], (truly - lowest)[told]
-        variance = (seems - lowest)[told] * width
-        spread = max(spread, float(((variance + width * gap / 6) / gap**2).max(initial=0.0)))
-        greedy = model.after(greedy[:, None] & (seems >= (top - margin)[:, None]))
-        likely = model.after(likely[:, None] & (seems > mistake[:, None]))
-    return True, spread
+        next_greedy, next_likely = np.zeros(n_states, np.bool_), np.zeros(n_states, np.bool_)
+        for state in range(n_states):
+            if not (greedy[state] or likely[state]):
+                continue
+            top, mistake = -np.inf, -np.inf
+            least = best[left, state] - tolerance * max(1.0, abs(best[left, state]))
+            for action in range(n_actions):
+                seems[action] = action_value(model, state, action, current[left - 1], 1.0)
+                truly[action] = action_value(model, state, action, best[left - 1], 1.0)
+                lowest[action] = action_value(model, state, action, worst[left - 1], 1.0)
+                top = max(top, seems[action])
+                if truly[action] < least:
+                    mistake = max(mistake, seems[action])
+            margin = tolerance * max(1.0, abs(top))
+            gap = top - mistake
+            if gap <= margin:
+                is_optimal = is_optimal and not greedy[state]
+                spread = np.inf
+            elif likely[state] and mistake > -np.inf:
+                for action in range(n_actions):
+                    width = truly[action] - lowest[action]
+                    variance = (seems[action] - lowest[action]) * width
+                    spread = max(spread, (variance + width * gap / 6) / gap**2)
+            for action in range(n_actions):
+                taken = greedy[state] and seems[action] >= top - margin
+                possible = likely[state] and seems[action] > mistake
+                for k in range(prob.shape[2]):
+                    if prob[state, action, k] > 0 and not terminated[state, action, k]:
+                        reached = next_state[state, action, k]
+                        next_greedy[reached] = next_greedy[reached] or taken
+                        next_likely[reached] = next_likely[reached] or possible
+        if not is_optimal:
+            break
+        greedy, likely = next_greedy, next_likely
+    return is_optimal, spread

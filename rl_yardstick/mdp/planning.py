@@ -367,32 +367,30 @@ class PlanningProblem:
         The linear system is solved by BiCGSTAB (van der Vorst, 1992), with a sweep as
         preconditioner, to a hundredth of the residual. Needs a discount below one.
         """
+        from scipy.sparse import csr_array
         from scipy.sparse.linalg import LinearOperator, bicgstab
 
         rows = policy_rows(self.model.dynamics, self.discount, order, policy)
         weight, following, reward, _ = rows
-        n = len(order)
-        stays = following == np.arange(n)[:, None]
-        diagonal = 1.0 - np.where(stays, weight, 0.0).sum(axis=1)
-
-        def system(found: Floats) -> Floats:
-            return np.asarray(found - (weight * found[following]).sum(axis=1))
+        n, ends = len(order), np.arange(0, weight.size + 1, weight.shape[1])
+        moves = csr_array((weight.ravel(), following.ravel(), ends), shape=(n, n))
+        diagonal = 1 - moves.diagonal()
 
         def sweep(right: Floats) -> Floats:
             found = np.zeros(n)
             evaluate(weight, following, right, diagonal, found)
             return found
 
-        missing = reward - system(values[order])
+        missing = reward - values[order] + moves @ values[order]
         change, _ = bicgstab(
-            LinearOperator((n, n), system, dtype=np.float64),
+            LinearOperator((n, n), lambda v: v - moves @ v, dtype=np.float64),
             missing,
             rtol=ACCURACY_OF_SOLUTIONS,
             maxiter=MOST_KRYLOV_STEPS,
             M=LinearOperator((n, n), sweep, dtype=np.float64),
         )
         found = values[order] + change
-        if np.abs(reward - system(found)).max() <= np.abs(missing).max():
+        if np.abs(reward - found + moves @ found).max() <= np.abs(missing).max():
             values[order] = found
 
     def action_values(self, values: Floats) -> Floats:
@@ -459,6 +457,18 @@ def action_value(model: Dynamics, state: int, action: int, later: Floats, discou
         if prob[state, action, k] > 0 and not terminated[state, action, k]:
             value += discount * prob[state, action, k] * later[next_state[state, action, k]]
     return value
+
+
+@called
+def pass_on(model: Dynamics, state: int, action: int, weight: float, there: Floats) -> float:
+    """Move a state's probability to its successors in ``there``; returns the part that goes on."""
+    prob, next_state, terminated, _ = model
+    left = 0.0
+    for k in range(prob.shape[2]):
+        if prob[state, action, k] > 0 and not terminated[state, action, k]:
+            there[next_state[state, action, k]] += weight * prob[state, action, k]
+            left += weight * prob[state, action, k]
+    return left
 
 
 @compiled
@@ -558,13 +568,18 @@ def policy_rows(
         minus the weight of states at the same or a later index, (n,).
     """
     prob, next_state, terminated, mean_reward = model
-    here, taken = np.arange(len(order), dtype=np.int32), (order, policy[order])
+    here, taken = np.arange(len(order), dtype=np.int32), order * prob.shape[1] + policy[order]
     place = np.full(len(prob), -1, np.int32)
     place[order] = here
-    following = place[next_state[taken]]
-    weight = np.where(terminated[taken] | (following < 0), 0.0, discount * prob[taken])
-    settled = 1 - np.where(following >= here[:, None], weight, 0.0).sum(axis=1)
-    return weight, np.maximum(following, 0), mean_reward[taken], settled
+    # Taken from flat arrays, which is twice as fast as by two indices.
+    chance, reached, ends = (
+        array.reshape(-1, prob.shape[2]).take(taken, axis=0)
+        for array in (prob, next_state, terminated)
+    )
+    following = place.take(reached)
+    weight = discount * chance * ~(ends | (following < 0))
+    settled = 1 - np.einsum("nk,nk->n", weight, following >= here[:, None])
+    return weight, np.maximum(following, 0), mean_reward.take(taken), settled
 
 
 @compiled
