@@ -365,9 +365,15 @@ class LimitedEpisodes:
         at = states, action, self.model.prob[states, action].argmax(axis=1)
         if (self.policy[states, action] != 1).any() or (self.model.prob[at] != 1).any():
             return None
-        moments, following = np.zeros((len(states), 5)), self._places(states)
-        way = following[self.model.next_state[at]], self.model.terminated[at], self.model.reward[at]
-        total = walked(*way, ends_well[at], self.horizon, discount)
+        moments, n = np.zeros((len(states), 5)), len(states)
+        following = self._places(states)[self.model.next_state[at]]
+        step = (
+            np.append(self.model.reward[at], 0.0),
+            np.append(np.ones(n), 0.0),
+            np.append(ends_well[at], False),
+            np.append(np.where(self.model.terminated[at], n, following), n),
+        )
+        total = walked(step, self.horizon, discount)
         for place, part in zip((0, 2, 4), total[:3], strict=True):
             moments[:, place] = part[:-1]
         return moments

@@ -269,23 +269,10 @@ def _merge(groups: Floats, place: int, chance: float, mean: float, spread: float
 Ways = tuple[Floats, Floats, Bools, Ints]
 
 
-def walked(
-    next_state: Ints,
-    terminated: Bools,
-    reward: Floats,
-    success: Bools,
-    horizon: int,
-    discount: float,
-) -> Ways:
-    """The result of ``horizon`` steps from each state, by doubling."""
-    n = len(reward)
-    step = (
-        np.append(reward, 0.0),
-        np.append(np.ones(n), 0.0),
-        np.append(success & terminated, False),
-        np.append(np.where(terminated, n, next_state), n),
-    )
-    total = np.zeros(n + 1), np.zeros(n + 1), np.zeros(n + 1, np.bool_), np.arange(n + 1)
+def walked(step: Ways, horizon: int, discount: float) -> Ways:
+    """The result of ``horizon`` steps from each state, from that of one, by doubling."""
+    n = len(step[0])
+    total = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_), np.arange(n)
     n_done, n_steps = 0, 1
     while True:
         if horizon & n_steps:
