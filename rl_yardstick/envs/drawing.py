@@ -199,8 +199,7 @@ class Renderer(ABC):
     def __init__(self, fps: int, title: str) -> None:
         self.fps = fps  # pictures a second in a window
         self.title = title
-        self._window: pygame.Surface | None = None
-        self._clock: pygame.time.Clock | None = None
+        self._window: tuple[pygame.Surface, pygame.time.Clock] | None = None
 
     @abstractmethod
     def paint(self, scene: Any) -> pygame.Surface:
@@ -221,13 +220,13 @@ class Renderer(ABC):
         if self._window is None:
             pygame.display.init()
             pygame.display.set_caption(self.title)
-            self._window = pygame.display.set_mode(picture.get_size())
-            self._clock = pygame.time.Clock()
-        assert self._clock is not None
-        self._window.blit(picture, (0, 0))
+            window = pygame.display.set_mode(picture.get_size())
+            self._window = window, pygame.time.Clock()
+        window, clock = self._window
+        window.blit(picture, (0, 0))
         pygame.event.pump()
         pygame.display.update()
-        self._clock.tick(self.fps)
+        clock.tick(self.fps)
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -185,7 +185,8 @@ def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
 
     def add(low: Floats, high: Floats, most: float) -> None:
         nonlocal work
-        values = _returns_in_box(model.dynamics, states, groups, low, high, nothing, horizon)
+        box = states, low[groups], high[groups]
+        values = _returns_in_box(model.dynamics, *box, nothing, horizon)
         most = min(most, float(model.initial @ values))
         work -= 1
         if most > enough and work >= n_slopes:
@@ -226,7 +227,7 @@ def _bound_by_slopes(
     values, advantages = _advantages(model.dynamics, states, policy, horizon)
     bound = float(model.initial @ values)
     free = (*model.dynamics[:3], np.zeros_like(model.expected_reward))  # without rewards
-    box = states, groups, low, high
+    box = states, low[groups], high[groups]
     for group in seen:
         for action in range(model.n_actions):
             more = np.where(groups == group, advantages[:, :, action], 0.0)
@@ -254,17 +255,11 @@ def _inside(low: Floats, high: Floats) -> Floats:
 
 @compiled
 def _returns_in_box(
-    model: Dynamics,
-    states: Ints,
-    groups: Ints,
-    low: Floats,
-    high: Floats,
-    extra: Floats,
-    horizon: int,
+    model: Dynamics, states: Ints, low: Floats, high: Floats, extra: Floats, horizon: int
 ) -> Floats:
     """The returns (S,) of an agent that sees the state and chooses within the box at each step.
 
-    It receives ``extra`` (1 or horizon, S) as well, in each state at each step.
+    The box has shape (S, A). It receives ``extra`` (1 or horizon, S), at each step in each state.
     """
     prob = model[0]
     later, now = np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
@@ -274,8 +269,7 @@ def _returns_in_box(
         for state in states:
             for action in range(prob.shape[1]):
                 values[action] = action_value(model, state, action, later, 1.0)
-            group = groups[state]
-            now[state] = _best_in_box(values, low[group], high[group], is_used)
+            now[state] = _best_in_box(values, low[state], high[state], is_used)
             now[state] += extra[min(step, len(extra) - 1), state]
             changed = changed or now[state] != later[state]
         now, later = later, now

@@ -578,7 +578,9 @@ def policy_rows(
     )
     following = place.take(reached)
     weight = discount * chance * ~(ends | (following < 0))
-    settled = 1 - np.einsum("nk,nk->n", weight, following >= here[:, None])
+    settled = np.ones(len(order))
+    for k in range(weight.shape[1]):
+        settled -= np.where(following[:, k] >= here, weight[:, k], 0.0)
     return weight, np.maximum(following, 0), mean_reward.take(taken), settled
 
 

@@ -164,8 +164,11 @@ class TransitionModel:
     def action_values(self, later: Floats, discount: float = 1.0) -> Floats:
         """The action values, shape (S, A), from the state values one step later."""
         following = np.where(self.goes_on, later[self.next_state], 0.0)
-        expected = np.einsum("sak,sak->sa", self.prob, following)
-        return np.asarray(self.expected_reward + discount * expected)
+        values = self.expected_reward.copy()
+        # In this order, the sums are those of compiled functions, to the last bit.
+        for k in range(self.n_outcomes):
+            values += discount * self.prob[:, :, k] * following[:, :, k]
+        return values
 
     @cached_property
     def reachable(self) -> Bools:
