@@ -395,7 +395,13 @@ class PlanningProblem:
 
     def action_values(self, values: Floats) -> Floats:
         """Values of shape (S, A), minus infinity for actions that are not allowed."""
-        return np.where(self.part.allowed, self.model.action_values(values, self.discount), -np.inf)
+        model = self.model
+        following = np.where(model.goes_on, values[model.next_state], 0.0)
+        found = model.expected_reward.copy()
+        # In this order, the sums are those of the compiled sweeps, to the last bit.
+        for k in range(model.n_outcomes):
+            found += self.discount * model.prob[:, :, k] * following[:, :, k]
+        return np.where(self.part.allowed, found, -np.inf)
 
     def rounding(self, values: Floats) -> float:
         """The change of a value that rounding alone may make in one sweep."""

@@ -161,13 +161,10 @@ class TransitionModel:
         found[self.next_state[self.goes_on & actions[:, :, None]]] = True
         return found
 
-    def action_values(self, later: Floats, discount: float = 1.0) -> Floats:
-        """The action values, shape (S, A), from the state values one step later."""
+    def action_values(self, later: Floats) -> Floats:
+        """The undiscounted action values, shape (S, A), from the state values one step later."""
         following = np.where(self.goes_on, later[self.next_state], 0.0)
-        values = self.expected_reward.copy()
-        # In this order, the sums are those of compiled functions, to the last bit.
-        for k in range(self.n_outcomes):
-            values += discount * self.prob[:, :, k] * following[:, :, k]
+        values: Floats = self.expected_reward + np.einsum("sak,sak->sa", self.prob, following)
         return values
 
     @cached_property
