@@ -129,8 +129,8 @@ def values_of_a_policy(n_episodes: int) -> tuple[Figure, list[Statement]]:
     ]
 
 
-def learnt(n_episodes: int) -> Ints:
-    """The policy of Monte Carlo control after ``n_episodes``: the action for each observation."""
+def best_policy(n_episodes: int) -> tuple[Figure, list[Statement]]:
+    """Figure 5.2."""
     agent = agent_on(
         game,
         "monte_carlo",
@@ -142,13 +142,7 @@ def learnt(n_episodes: int) -> Ints:
         exploration_fraction=0.8,
     )
     learn_episodes(agent, n_episodes)
-    actions: Ints = agent.policy.q_table.argmax(axis=1)
-    return actions
-
-
-def best_policy(n_episodes: int) -> tuple[Figure, list[Statement]]:
-    """Figure 5.2."""
-    shown, blackjack, actions = observations(), model(), learnt(n_episodes)
+    shown, blackjack, actions = observations(), model(), agent.policy.q_table.argmax(axis=1)
     best = finite_horizon_optimum(blackjack, LONGEST).policy[0, : len(actions)].astype(np.int64)
     figure = Figure(figsize=(8, 6.4), layout="constrained")
     for axes, (title, policy) in zip(

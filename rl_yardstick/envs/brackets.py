@@ -16,7 +16,12 @@ from typing import Any
 
 import gymnasium as gym
 
-from rl_yardstick.envs.known_models import TRANSPARENT_WRAPPERS, time_limit, transition_model
+from rl_yardstick.envs.known_models import (
+    TRANSPARENT_WRAPPERS,
+    layers,
+    time_limit,
+    transition_model,
+)
 from rl_yardstick.envs.published_models import is_changed
 
 DATA = Path(__file__).with_name("brackets.json")
@@ -90,17 +95,13 @@ _NO_DYNAMICS = (
 
 def is_plain(env: gym.Env[Any, Any]) -> bool:
     """Whether wrappers change only observations, and no method was replaced by hand."""
-    while isinstance(env, gym.Wrapper):
-        kind = type(env)
-        if is_changed(env):
+    base, wrappers = layers(env)
+    for wrapper in wrappers:
+        name = f"{type(wrapper).__module__}.{type(wrapper).__qualname__}"
+        shows = isinstance(wrapper, gym.ObservationWrapper) and name.startswith(_OBSERVATION_HOMES)
+        if not (shows or name in TRANSPARENT_WRAPPERS):
             return False
-        only_shows = isinstance(env, gym.ObservationWrapper) and f"{kind.__module__}.".startswith(
-            _OBSERVATION_HOMES
-        )
-        if not only_shows and f"{kind.__module__}.{kind.__qualname__}" not in TRANSPARENT_WRAPPERS:
-            return False
-        env = env.env
-    return not is_changed(env)
+    return not any(map(is_changed, (base, *wrappers)))
 
 
 # The rewards of a step in environments without a transition model, by class.

@@ -199,8 +199,7 @@ class Renderer(ABC):
     def __init__(self, fps: int, title: str) -> None:
         self.fps = fps  # pictures a second in a window
         self.title = title
-        self._window: pygame.Surface | None = None
-        self._clock: pygame.time.Clock | None = None
+        self._window: tuple[pygame.Surface, pygame.time.Clock] | None = None
 
     @abstractmethod
     def paint(self, scene: Any) -> pygame.Surface:
@@ -221,13 +220,13 @@ class Renderer(ABC):
         if self._window is None:
             pygame.display.init()
             pygame.display.set_caption(self.title)
-            self._window = pygame.display.set_mode(picture.get_size())
-            self._clock = pygame.time.Clock()
-        assert self._clock is not None
-        self._window.blit(picture, (0, 0))
+            window = pygame.display.set_mode(picture.get_size())
+            self._window = window, pygame.time.Clock()
+        window, clock = self._window
+        window.blit(picture, (0, 0))
         pygame.event.pump()
         pygame.display.update()
-        self._clock.tick(self.fps)
+        clock.tick(self.fps)
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -281,9 +280,11 @@ class GridRenderer(Renderer):
         picture = self._background.copy()
         for cell in scene.collected:
             if self.detailed:
-                self._put(picture, EMPTIED_SHAPES, cell, self.cell)
+                self._blit(picture, self._sprite(EMPTIED_SHAPES, self.cell), cell)
             else:
-                picture.fill(FLOOR, pygame.Rect(self._corner(cell), (self.cell, self.cell)))
+                area = pygame.Rect(0, 0, self.cell, self.cell)
+                area.center = self._centre(cell)
+                picture.fill(FLOOR, area)
         width = max(round(TRAIL_WIDTH * self.cell), NARROWEST_TRAIL)
         for step in scene.steps:
             first, last = (self._centre(cell) for cell in sorted(step))
@@ -291,7 +292,8 @@ class GridRenderer(Renderer):
             picture.fill(BLUE, line.inflate(width, width))
         row, column = scene.place(scene.robot)
         if self.rows[row][column] == "M":
-            self._put(picture, BURST_SHAPES, scene.robot, self.marker * 3 // 2)
+            burst = self._sprite(BURST_SHAPES, self.marker * 3 // 2)
+            self._blit(picture, burst, scene.robot)
         robot = self._sprite(ROBOT_SHAPES, self.marker)
         degrees = {None: 0, 0: 0, 1: 180, 2: 90, 3: 270}[scene.last_move]
         self._blit(picture, pygame.transform.rotate(robot, degrees), scene.robot)
@@ -322,8 +324,8 @@ class GridRenderer(Renderer):
             if not drawn.isdisjoint(letters):
                 for column, letter in enumerate(letters):
                     if letter in drawn:
-                        cell = row * self.n_columns + column
-                        self._put(picture, LETTER_SHAPES[letter], cell, self.marker)
+                        sprite = self._sprite(LETTER_SHAPES[letter], self.marker)
+                        self._blit(picture, sprite, row * self.n_columns + column)
         if self.detailed:
             for x in range(self.cell, size[0], self.cell):
                 pygame.draw.line(picture, GRID, (x, 0), (x, size[1]))
@@ -331,25 +333,15 @@ class GridRenderer(Renderer):
                 pygame.draw.line(picture, GRID, (0, y), (size[0], y))
         return picture
 
-    def _put(
-        self, picture: pygame.Surface, shapes: tuple[Shape, ...], cell: int, size: int
-    ) -> None:
-        self._blit(picture, self._sprite(shapes, size), cell)
-
     def _blit(self, picture: pygame.Surface, sprite: pygame.Surface, cell: int) -> None:
         """Draw a sprite centred on a cell; markers stay inside the picture."""
         area = sprite.get_rect(center=self._centre(cell))
         picture.blit(sprite, area if self.detailed else area.clamp(picture.get_rect()))
 
-    def _corner(self, cell: int) -> tuple[int, int]:
-        """The upper left pixel of a cell."""
-        row, column = divmod(cell, self.n_columns)
-        return column * self.cell, row * self.cell
-
     def _centre(self, cell: int) -> tuple[int, int]:
         """The pixel in the middle of a cell."""
-        x, y = self._corner(cell)
-        return x + self.cell // 2, y + self.cell // 2
+        row, column = divmod(cell, self.n_columns)
+        return column * self.cell + self.cell // 2, row * self.cell + self.cell // 2
 
     def _sprite(self, shapes: tuple[Shape, ...], size: int) -> pygame.Surface:
         """Shapes as a square picture with smooth edges, drawn once for each size."""

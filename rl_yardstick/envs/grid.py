@@ -271,13 +271,8 @@ class GridDynamics:
             initial=initial,
         )
 
-    def action_mask(self, state: int) -> Bools:
-        """The moves that neither a wall nor the edge stops, bool of shape (4,); all if none."""
-        free = [not self.move(state, direction).bumped for direction in range(len(MOVES))]
-        return np.array(free) | (not any(free))
-
     def action_masks(self) -> Bools:
-        """`action_mask` of all states, bool of shape (S, 4)."""
+        """The moves that neither a wall nor the edge stops, all if none, bool of shape (S, 4)."""
         entered, _ = self._entered()
         free = ~self._per_code("blocked", np.bool_)[entered]
         free |= self._over()[:, None]
@@ -398,17 +393,20 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
     ) -> None:
         slip = check_number("slip", slip, 0, 1)
         self.random_start = check_flag("random_start", random_start)
-        passable = [
-            letter for letter, tile in tiles.items() if not (tile.blocked or tile.terminated)
-        ]
-        self.map = GridMap.read(desc, tiles, passable)
-        self.rows = self.map.rows
-        self.dynamics = GridDynamics(self.map, tiles, edge, slip)
+        self._set_map(desc, tiles, edge, slip)
         super().__init__(self.dynamics.n_states, len(MOVES), render_mode)
         self._slip_thresholds = np.cumsum(self.dynamics.outcome_prob).tolist()
         self.s = self.map.start
         self._bumped = False  # in the latest step
         self._steps: set[tuple[int, int]] = set()  # those of the episode, where it is rendered
+
+    def _set_map(
+        self, desc: Description, tiles: Mapping[str, Tile], edge: Tile, slip: float
+    ) -> None:
+        closed = {letter for letter, tile in tiles.items() if tile.blocked or tile.terminated}
+        self.map = GridMap.read(desc, tiles, tiles.keys() - closed)
+        self.rows = self.map.rows
+        self.dynamics = GridDynamics(self.map, tiles, edge, slip)
 
     def _draw_start(self) -> int:
         starts, thresholds = self._starts
@@ -432,7 +430,8 @@ class GridWorld(MapEnv, MaskedFiniteEnv):
         Where moves may slip, only the intended move counts. All moves are allowed in a cell that is
         walled in, and where an episode has ended. The convention is that of sb3-contrib's agents.
         """
-        return self.dynamics.action_mask(self.s)
+        free = [not self.dynamics.move(self.s, way).bumped for way in range(len(MOVES))]
+        return np.array(free) | (not any(free))
 
     def masks_of_states(self) -> Bools:
         """`action_masks` in each state, bool of shape (S, 4)."""

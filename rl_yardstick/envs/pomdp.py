@@ -263,17 +263,12 @@ def _hallway() -> World:
         elif facing == SOUTH and (row, column) in signs:
             readings[state, N_WALL_READINGS + signs.index((row, column))] = 1
         else:
-            readings[state, :N_WALL_READINGS] = _wall_readings([b not in CELLS for b in beside])
+            felt = np.array([1 - SEES_NO_WALL if b in CELLS else SEES_WALL for b in beside])
+            chances = np.stack([1 - felt, felt], axis=1)
+            readings[state, :N_WALL_READINGS] = reduce(np.kron, chances)
     at_goal = next_state // len(STEPS) == len(CELLS) - 1
     is_over = np.arange(n_states) // len(STEPS) == len(CELLS) - 1
     reward = np.where(is_over[:, None, None], 0.0, at_goal.astype(np.float64))
     initial = np.where(is_over, 0.0, 1 / (~is_over).sum())
     hidden = TransitionModel(prob, next_state, reward, at_goal, initial)
     return with_readings(hidden, readings, np.stack([readings] * prob.shape[1]))
-
-
-def _wall_readings(walls: list[bool]) -> NDArray[np.float64]:
-    """The chances of readings 0 to 15, for walls in front, to the right, behind, to the left."""
-    felt = np.array([SEES_WALL if is_wall else 1 - SEES_NO_WALL for is_wall in walls])
-    chances: Any = reduce(np.kron, np.stack([1 - felt, felt], axis=1))
-    return np.asarray(chances)

@@ -292,9 +292,7 @@ class OneHotObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
 
     def observation(self, observation: int) -> NDArray[np.float32]:
         """The vector of one number."""
-        hot = np.zeros(self._n, np.float32)
-        hot[int(observation) - self._first] = 1
-        return hot
+        return self.map_observations(np.array([observation])).ravel()
 
     def map_observations(self, batch: AnyInts) -> NDArray[np.float32]:
         """The vectors of many numbers of shape (n,), shape (n, number of values)."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum, moments_by_spreading, walked
 from rl_yardstick.mdp.graph import PolicyChain
-from rl_yardstick.mdp.planning import action_value
+from rl_yardstick.mdp.planning import action_value, pass_on
 from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
 
@@ -109,9 +109,7 @@ def last_visits(model: TransitionModel, policy: Policy, horizon: int, n_last: in
     """Expected visits to each state in the last steps before the limit, shape (S,)."""
     visits = state_visitation(model, policy, horizon)
     if n_last < horizon:
-        has_time = policy.ndim == 2 and policy.shape != model.prob.shape[:2]
-        before = policy[: horizon - n_last] if has_time and len(policy) == horizon > 1 else policy
-        visits = visits - state_visitation(model, before, horizon - n_last)
+        visits = visits - state_visitation(model, policy, horizon - n_last)
     return np.maximum(visits, 0.0)
 
 
@@ -188,21 +186,13 @@ def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats
     policy = canonical_policy(model, policy)
     states = np.flatnonzero(model.reachable)
     values = np.zeros(model.n_states)
-    moments = LimitedEpisodes(model, policy, horizon).along_ways(states, 1.0, model.terminated)
+    episodes = LimitedEpisodes(model, policy, horizon)
+    moments = episodes.along_ways(states, 1.0, model.terminated)
     if moments is not None:
         values[states] = moments[:, 0]
-        return values
-    place = np.cumsum(model.reachable) - 1
-    values[states] = _returns_under_limit(
-        (
-            model.prob[states],
-            place[model.next_state[states]],
-            model.terminated[states],
-            model.expected_reward[states],
-        ),
-        chances_in(model, policy, states),
-        horizon,
-    )
+    else:
+        chances = chances_in(model, policy, states)
+        values[states] = _returns_under_limit(episodes.rows(states), chances, horizon)
     return values
 
 
@@ -332,7 +322,7 @@ class LimitedEpisodes:
             mean, variance, length, spread, rate = found.tolist()
             return PolicyReturn(mean, variance, length, spread, rate if with_success else None)
         if moments is None:
-            arrays = (*self._rows(states), model.reward[states], ends_well[states])
+            arrays = (*self.rows(states)[:3], model.reward[states], ends_well[states])
             chances = chances_in(self.model, self.policy, states)
             if len(chances) == 1 and ((chances == 0) | (chances == 1)).all():
                 # Keep the rows of these actions only: the sweeps would skip all others each time.
@@ -347,17 +337,17 @@ class LimitedEpisodes:
         states, visits = self._visited(), np.zeros(self.model.n_states)
         chances = chances_in(self.model, self.policy, states)
         start = self.model.initial[states]
-        visits[states] = visits_under_limit(*self._rows(states), chances, start, self.horizon)
+        visits[states] = visits_under_limit(self.rows(states), chances, start, self.horizon)
         return visits
 
     def _visited(self) -> Ints:
         return np.flatnonzero(self.model.reached_by(actions_used(self.model, self.policy)))
 
-    def _rows(self, states: Ints) -> tuple[Floats, Ints, Bools]:
-        """Rows of n states: prob, next_state (as indices into these n states), terminated."""
-        model = self.model
-        following = self._places(states)[model.next_state[states]]
-        return model.prob[states], following, model.terminated[states]
+    def rows(self, states: Ints) -> Dynamics:
+        """The dynamics of n states, whose next states are indices into these n states."""
+        prob, next_state, terminated, expected_reward = self.model.dynamics
+        following = self._places(states)[next_state[states]]
+        return prob[states], following, terminated[states], expected_reward[states]
 
     def _places(self, states: Ints) -> Ints:
         place = np.full(self.model.n_states, -1)
@@ -375,9 +365,15 @@ class LimitedEpisodes:
         at = states, action, self.model.prob[states, action].argmax(axis=1)
         if (self.policy[states, action] != 1).any() or (self.model.prob[at] != 1).any():
             return None
-        moments, following = np.zeros((len(states), 5)), self._places(states)
-        way = following[self.model.next_state[at]], self.model.terminated[at], self.model.reward[at]
-        total = walked(*way, ends_well[at], self.horizon, discount)
+        moments, n = np.zeros((len(states), 5)), len(states)
+        following = self._places(states)[self.model.next_state[at]]
+        step = (
+            np.append(self.model.reward[at], 0.0),
+            np.append(np.ones(n), 0.0),
+            np.append(ends_well[at], False),
+            np.append(np.where(self.model.terminated[at], n, following), n),
+        )
+        total = walked(step, self.horizon, discount)
         for place, part in zip((0, 2, 4), total[:3], strict=True):
             moments[:, place] = part[:-1]
         return moments
@@ -407,8 +403,7 @@ def moments_under_limit(
         changed = False
         for state in range(prob.shape[0]):
             outcomes = (prob[state], next_state[state], terminated[state], reward[state])
-            _means(outcomes, success[state], chances[state], discount, later, now[state])
-            _variances(outcomes, chances[state], discount, later, now[state])
+            _moments(outcomes, success[state], chances[state], discount, later, now[state])
             for moment in range(5):
                 changed = changed or now[state, moment] != later[state, moment]
         now, later = later, now
@@ -419,14 +414,13 @@ def moments_under_limit(
 
 
 @called
-def _means(
+def _moments(
     model: Dynamics, success: Bools, chances: Floats, discount: float, later: Floats, now: Floats
 ) -> None:
-    """The means of one state, from its rows of the model and the moments one step later."""
+    """The moments of one state, from its rows of the model and the moments one step later."""
     prob, next_state, terminated, reward = model
-    now[0] = 0.0
+    now[:] = 0.0
     now[2] = 1.0
-    now[4] = 0.0
     for action in range(prob.shape[0]):
         for k in range(prob.shape[1]):
             weight = chances[action] * prob[action, k]
@@ -438,16 +432,7 @@ def _means(
                     now[0] += weight * discount * after[0]
                     now[2] += weight * after[2]
                     now[4] += weight * after[4]
-
-
-@called
-def _variances(
-    model: Dynamics, chances: Floats, discount: float, later: Floats, now: Floats
-) -> None:
-    """The variances of one state, by the law of total variance."""
-    prob, next_state, terminated, reward = model
-    now[1] = 0.0
-    now[3] = 0.0
+    # The law of total variance.
     for action in range(prob.shape[0]):
         for k in range(prob.shape[1]):
             weight = chances[action] * prob[action, k]
@@ -465,9 +450,7 @@ def _variances(
 
 
 @compiled
-def visits_under_limit(
-    prob: Floats, next_state: Ints, terminated: Bools, policy: Floats, initial: Floats, horizon: int
-) -> Floats:
+def visits_under_limit(model: Dynamics, policy: Floats, initial: Floats, horizon: int) -> Floats:
     """The expected number of steps taken in each state, shape (n,)."""
     visits = np.zeros(len(initial))
     here = initial.copy()
@@ -479,12 +462,10 @@ def visits_under_limit(
             visits[state] += here[state]
             if here[state] == 0:
                 continue
-            for action in range(prob.shape[1]):
-                for k in range(prob.shape[2]):
-                    weight = here[state] * chances[state, action] * prob[state, action, k]
-                    if weight > 0 and not terminated[state, action, k]:
-                        there[next_state[state, action, k]] += weight
-                        left += weight
+            for action in range(chances.shape[1]):
+                weight = here[state] * chances[state, action]
+                if weight > 0:
+                    left += pass_on(model, state, action, weight, there)
         here = there
         if left == 0:
             break

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,68 +64,41 @@ def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None
         plan = value_iteration(model, 1.0)
     except ValueError:
         return None  # without a limit there is no finite optimum
-    reached = model.reachable
-    values = plan.values[reached]
+    values = plan.values[model.reachable]
     if not (np.isfinite(values).all() and np.isfinite(plan.error_bound)):
         return None
     lowest_start = float(plan.values[model.initial > 0].min())
     highest, lowest = max(float(values.max()), 0.0), min(float(values.min()), 0.0)
-    rows = model.prob, model.next_state, model.terminated, model.reward
-    step_cost, fall, variance = drift(rows, reached, plan.values)
+    step_cost, fall, variance = drift(model, plan.values)
     slack = 4 * plan.error_bound  # error of differences of values, each within the bound
     overdue = horizon * step_cost - (highest - lowest_start) - slack
-    fall, deviation = fall + slack, math.sqrt(variance) + slack
+    loss, fall, deviation = overdue + lowest - slack, fall + slack, math.sqrt(variance) + slack
     chance = 1.0
-    if step_cost > 0:
-        chance = chance_of_losing(overdue + lowest - slack, fall, deviation**2, horizon)
+    if step_cost > 0 and loss > 0:
+        scale = 2 * horizon * deviation**2 + 2 * fall * loss / 3
+        chance = math.exp(-(loss**2) / scale) if scale > 0 else 0.0
     error = plan.error_bound + max(-lowest, highest) * chance
     return plan.start_value if error <= TOLERANCE * max(1.0, abs(plan.start_value)) else None
 
 
-def chance_of_losing(loss: float, fall: float, variance: float, horizon: int) -> float:
-    """A bound on the probability that ``horizon`` steps lose ``loss`` by chance alone.
-
-    ``variance`` bounds that of the value after a step, ``fall`` how far it falls below its mean.
-    """
-    if loss <= 0:
-        return 1.0
-    scale = 2 * horizon * variance + 2 * fall * loss / 3
-    return math.exp(-(loss**2) / scale) if scale > 0 else 0.0
-
-
-@compiled
-def drift(model: Dynamics, reached: Bools, values: Floats) -> tuple[float, float, float]:
+def drift(model: TransitionModel, values: Floats) -> tuple[float, float, float]:
     """How a step changes the value: the worst cases over all reachable states and actions.
 
     Returns the least cost of a step that goes on, the largest fall of the value below its mean in a
     step, and the largest variance of the value after a step. An end with reward r counts as a step
     of least cost e to a state of value r + e.
     """
-    prob, next_state, terminated, reward = model
-    step_cost = np.inf
-    for state in range(prob.shape[0]):
-        if reached[state]:
-            for action in range(prob.shape[1]):
-                for k in range(prob.shape[2]):
-                    if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                        step_cost = min(step_cost, -reward[state, action, k])
-    fall, variance = 0.0, 0.0
-    for state in range(prob.shape[0]):
-        if reached[state]:
-            for action in range(prob.shape[1]):
-                mean, square, lowest = 0.0, 0.0, np.inf
-                for k in range(prob.shape[2]):
-                    if prob[state, action, k] > 0:
-                        after = values[next_state[state, action, k]]
-                        if terminated[state, action, k]:
-                            after = reward[state, action, k] + step_cost
-                        gap = after - values[state]
-                        mean += prob[state, action, k] * gap
-                        square += prob[state, action, k] * gap * gap
-                        lowest = min(lowest, gap)
-                fall = max(fall, mean - lowest)
-                variance = max(variance, square - mean * mean)
-    return step_cost, fall, variance
+    states = np.flatnonzero(model.reachable)
+    prob, terminated, reward = model.prob[states], model.terminated[states], model.reward[states]
+    going = reward[model.goes_on[states]]
+    step_cost = -float(going.max()) if going.size else 0.0
+    after = np.where(terminated, reward + step_cost, values[model.next_state[states]])
+    gap = np.where(prob > 0, after - values[states, None, None], np.inf)
+    lowest = gap.min(axis=2)
+    gap[prob == 0] = 0.0
+    mean, square = (prob * gap).sum(axis=2), (prob * gap**2).sum(axis=2)
+    fall, variance = (mean - lowest).max(), (square - mean**2).max()
+    return step_cost, max(float(fall), 0.0), max(float(variance), 0.0)
 
 
 # Spreading.
@@ -171,7 +145,10 @@ def moments_by_spreading(
     here[: len(starts)] = starts
     over = np.zeros((3, 3))
     least = SHARE_LEFT_OUT / (n_states * horizon)  # the least probability of a state at a step
-    limits = _best_rewards(rows[0], rows[2], rows[3])
+    prob, _, terminated, reward, _ = rows
+    best_end = float(reward[(prob > 0) & terminated].max(initial=-np.inf))
+    best_step = float(reward[(prob > 0) & ~terminated].max(initial=-np.inf))
+    limits = best_end, best_step
     groups = now, later, here, there
     if not _follow(
         rows, policy, groups, len(starts), over, horizon, discount, least, limits, floor
@@ -284,20 +261,6 @@ def _merge(groups: Floats, place: int, chance: float, mean: float, spread: float
         groups[place, 0] = total
 
 
-@compiled
-def _best_rewards(prob: Floats, terminated: Bools, reward: Floats) -> tuple[float, float]:
-    """The highest reward of an end, and of any other step; minus infinity without any."""
-    best_end, best_step = -np.inf, -np.inf
-    for state in range(prob.shape[0]):
-        for action in range(prob.shape[1]):
-            for k in range(prob.shape[2]):
-                if prob[state, action, k] > 0 and terminated[state, action, k]:
-                    best_end = max(best_end, reward[state, action, k])
-                elif prob[state, action, k] > 0:
-                    best_step = max(best_step, reward[state, action, k])
-    return best_end, best_step
-
-
 # Deterministic episodes.
 
 # The result of some number of steps from each state, arrays of shape (n + 1,), the last entry for
@@ -306,48 +269,30 @@ def _best_rewards(prob: Floats, terminated: Bools, reward: Floats) -> tuple[floa
 Ways = tuple[Floats, Floats, Bools, Ints]
 
 
-@compiled
-def walked(
-    next_state: Ints,
-    terminated: Bools,
-    reward: Floats,
-    success: Bools,
-    horizon: int,
-    discount: float,
-) -> Ways:
-    """The result of ``horizon`` steps from each state, by doubling."""
-    n = len(reward)
-    step = np.zeros(n + 1), np.ones(n + 1), np.zeros(n + 1, np.bool_), np.full(n + 1, n)
-    step[1][n] = 0.0
-    for state in range(n):
-        step[0][state] = reward[state]
-        step[2][state] = success[state] and terminated[state]
-        if not terminated[state]:
-            step[3][state] = next_state[state]
-    total = np.zeros(n + 1), np.zeros(n + 1), np.zeros(n + 1, np.bool_), np.arange(n + 1)
+def walked(step: Ways, horizon: int, discount: float) -> Ways:
+    """The result of ``horizon`` steps from each state, from that of one, by doubling."""
+    n = len(step[0])
+    total = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_), np.arange(n)
     n_done, n_steps = 0, 1
     while True:
         if horizon & n_steps:
-            total = _followed(total, step, discount ** float(n_done))
+            total = _followed(total, step, discount**n_done)
             n_done += n_steps
         if n_done == horizon:
             return total
-        step = _followed(step, step, discount ** float(n_steps))
+        step = _followed(step, step, discount**n_steps)
         n_steps *= 2
 
 
-@compiled
 def _followed(first: Ways, then: Ways, discount: float) -> Ways:
     """The steps of ``first``, then those of ``then`` with rewards multiplied by ``discount``."""
-    n = len(first[0])
-    both = np.empty(n), np.empty(n), np.empty(n, np.bool_), np.empty(n, np.int64)
-    for state in range(n):
-        place = first[3][state]
-        both[0][state] = first[0][state] + discount * then[0][place]
-        both[1][state] = first[1][state] + then[1][place]
-        both[2][state] = first[2][state] or then[2][place]
-        both[3][state] = then[3][place]
-    return both
+    reward, length, success, place = first
+    return (
+        reward + discount * then[0][place],
+        length + then[1][place],
+        success | then[2][place],
+        then[3][place],
+    )
 
 
 # The smallest unsigned integers that hold the actions.
@@ -380,7 +325,6 @@ def finite_horizon_optimum(
 ) -> FiniteHorizonPlan:
     """Plan backwards from the time limit.
 
-    Stops once a step changes no value in its last bit: further steps would change none either.
     Sutton and Barto, Reinforcement Learning, 2nd edition, chapter 4; Puterman, Markov
     Decision Processes, 1994, section 4.5.
 
@@ -391,19 +335,31 @@ def finite_horizon_optimum(
         raise ValueError(f"horizon is {horizon}, it must be at least 1")
     if not 0 <= discount <= 1:
         raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
-    states = np.flatnonzero(model.reachable)
-    allowed = model.allowed_actions(mask)
-    values = np.zeros(model.n_states)
     rows: list[Actions] = []
-    for _ in range(horizon):
-        earlier = np.zeros(model.n_states)
-        actions = np.zeros(model.n_states, np.min_scalar_type(model.n_actions - 1))
-        back_up(model.dynamics, allowed, float(discount), states, values, earlier, actions)
-        rows.append(actions)
-        if np.array_equal(earlier, values):
-            break
+    values = np.zeros(model.n_states)
+    for earlier, actions in backwards(model, horizon, discount, mask):
         values = earlier
+        rows.append(actions)
     return FiniteHorizonPlan(values, np.array(rows), horizon, float(model.initial @ values))
+
+
+def backwards(
+    model: TransitionModel, horizon: int, discount: float = 1.0, mask: Bools | None = None
+) -> Iterator[tuple[Floats, Actions]]:
+    """Optimal values and actions with 1, 2, ... steps left, each of shape (S,).
+
+    Stops once a step changes no value in its last bit: further steps would change none either.
+    """
+    states, allowed = np.flatnonzero(model.reachable), model.allowed_actions(mask)
+    later = np.zeros(model.n_states)
+    for _ in range(horizon):
+        values = np.zeros(model.n_states)
+        actions = np.zeros(model.n_states, np.min_scalar_type(model.n_actions - 1))
+        back_up(model.dynamics, allowed, float(discount), states, later, values, actions)
+        yield values, actions
+        if np.array_equal(values, later):
+            return
+        later = values
 
 
 @compiled

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rl_yardstick.machine_code.compiling import called, compiled
+from rl_yardstick.machine_code.compiling import compiled
 from rl_yardstick.mdp.evaluation import Policy, canonical_policy, chances_in, policy_return
-from rl_yardstick.mdp.finite_horizon import back_up
+from rl_yardstick.mdp.finite_horizon import backwards
 from rl_yardstick.mdp.graph import PolicyChain
-from rl_yardstick.mdp.planning import action_value
+from rl_yardstick.mdp.planning import action_value, pass_on
 from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, Ints, TransitionModel
 
 # The largest number of values to store over all steps, 8 bytes each.
@@ -142,8 +142,20 @@ def first_differences(
     others = chances_in(model, canonical_policy(model, other), states)
     rows = _policy_rows(model.dynamics, chances, none, horizon)
     other_rows = _policy_rows(model.dynamics, others, none, horizon)
-    found = _partings(model.dynamics, chances, others, model.initial, rows, other_rows, horizon)
-    return FirstDifferences(*found)
+    met, gains = np.zeros(model.n_states), np.zeros(model.n_states)
+    here: Floats = model.initial
+    reached = model.next_state[model.goes_on]
+    for step in range(horizon):
+        taken, other = (each[min(step, len(each) - 1)] for each in (chances, others))
+        now, other_now = (each[min(horizon - step, len(each) - 1)] for each in (rows, other_rows))
+        parting = np.where((np.abs(taken - other) > SAME).any(axis=1), here, 0.0)
+        met += parting
+        gains += parting * (now - other_now)
+        flow = ((here - parting)[:, None] * taken)[:, :, None] * model.prob
+        here = np.bincount(reached, flow[model.goes_on], model.n_states).astype(np.float64)
+        if not here.any():
+            break
+    return FirstDifferences(met, gains)
 
 
 def policy_gradient(model: TransitionModel, policy: Floats, horizon: int) -> tuple[float, Floats]:
@@ -175,15 +187,9 @@ def _optimal_rows(model: TransitionModel, horizon: int) -> Floats:
 
     With m steps or more left they are those of the last row.
     """
-    states = np.flatnonzero(model.reachable)
-    allowed = model.allowed_actions()
     rows = [np.zeros(model.n_states)]
-    for _ in range(horizon):
-        earlier, actions = np.zeros(model.n_states), np.zeros(model.n_states, np.uint64)
-        back_up(model.dynamics, allowed, 1.0, states, rows[-1], earlier, actions)
-        if np.array_equal(earlier, rows[-1]):
-            break
-        rows.append(earlier)
+    for values, _ in backwards(model, horizon):
+        rows.append(values)
         _check_size(len(rows), model)
     return np.array(rows)
 
@@ -230,8 +236,7 @@ def discounted_values(model: TransitionModel, policy: Floats, discount: float) -
 
 def expected_next(model: TransitionModel, values: Floats) -> Floats:
     """Expected value of the state after each action, shape (S, A); 0 after termination."""
-    goes_on = (model.prob > 0) & ~model.terminated
-    following = np.where(goes_on, values[model.next_state], 0.0)
+    following = np.where(model.goes_on, values[model.next_state], 0.0)
     mean: Floats = np.einsum("sak,sak->sa", model.prob, following)
     return mean
 
@@ -296,18 +301,6 @@ def expected_estimates(
 # Compiled. With more steps left than there are rows of values, the last row applies.
 
 
-@called
-def _spread(model: Dynamics, state: int, action: int, weight: float, there: Floats) -> float:
-    """Move a state's probability to its successors in ``there``; returns the part that goes on."""
-    prob, next_state, terminated, _ = model
-    left = 0.0
-    for k in range(prob.shape[2]):
-        if prob[state, action, k] > 0 and not terminated[state, action, k]:
-            there[next_state[state, action, k]] += weight * prob[state, action, k]
-            left += weight * prob[state, action, k]
-    return left
-
-
 @compiled
 def _losses(
     model: Dynamics,
@@ -351,7 +344,7 @@ def _losses(
                 weight = here[state] * weights[action]
                 if weight > 0:
                     losses[state] += weight * max(now[state] - value, 0.0)
-                    goes_on += _spread(model, state, action, weight, there)
+                    goes_on += pass_on(model, state, action, weight, there)
         here = there
         if goes_on == 0:
             break
@@ -381,44 +374,3 @@ def _policy_rows(model: Dynamics, chances: Floats, repaired: Bools, horizon: int
         if not changed and len(chances) == 1:
             return rows[: left + 1].copy()
     return rows
-
-
-@compiled
-def _partings(
-    model: Dynamics,
-    chances: Floats,
-    others: Floats,
-    initial: Floats,
-    rows: Floats,
-    other_rows: Floats,
-    horizon: int,
-) -> tuple[Floats, Floats]:
-    """Probabilities (S,) of the first difference in each state, and its gains (S,)."""
-    n_states, n_actions = model[3].shape
-    met, gains = np.zeros(n_states), np.zeros(n_states)
-    here = initial.copy()
-    for step in range(horizon):
-        taken = chances[min(step, len(chances) - 1)]
-        other = others[min(step, len(others) - 1)]
-        now = rows[min(horizon - step, len(rows) - 1)]
-        other_now = other_rows[min(horizon - step, len(other_rows) - 1)]
-        there = np.zeros(n_states)
-        goes_on = 0.0
-        for state in range(n_states):
-            if here[state] == 0:
-                continue
-            differs = False
-            for action in range(n_actions):
-                differs = differs or abs(taken[state, action] - other[state, action]) > SAME
-            if differs:
-                met[state] += here[state]
-                gains[state] += here[state] * (now[state] - other_now[state])
-                continue
-            for action in range(n_actions):
-                weight = here[state] * taken[state, action]
-                if weight > 0:
-                    goes_on += _spread(model, state, action, weight, there)
-        here = there
-        if goes_on == 0:
-            break
-    return met, gains

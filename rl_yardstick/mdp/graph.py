@@ -28,8 +28,8 @@ def steps_to_end(model: TransitionModel, allowed: Bools, target: Bools) -> tuple
     order = np.empty(model.n_states, np.int64)
     nearest = np.concatenate([np.flatnonzero(steps == 0), np.flatnonzero(steps == 1)])
     order[: len(nearest)] = nearest
-    edges = (model.prob, model.next_state, model.terminated, allowed)
-    found = _search_backwards(*_predecessors(*edges), steps, order, len(nearest))
+    leads = model.goes_on & allowed[:, :, None]
+    found = _search_backwards(leads, model.next_state, steps, order, len(nearest))
     return steps, order[:found]
 
 
@@ -63,47 +63,28 @@ def end_components(model: TransitionModel, allowed: Bools) -> tuple[Ints, Bools]
 
 
 @compiled
-def _predecessors(
-    prob: Floats, next_state: AnyInts, terminated: Bools, allowed: Bools
-) -> tuple[Ints, AnyInts]:
-    """Where each state's predecessors begin in a list of all, shape (S + 1,); and that list."""
-    n_states, n_actions, n_outcomes = prob.shape
-    first = np.zeros(n_states + 1, np.int64)
-    for state in range(n_states):
-        for action in range(n_actions):
-            if allowed[state, action]:
-                for k in range(n_outcomes):
-                    if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                        first[next_state[state, action, k] + 1] += 1
-    for state in range(n_states):
-        first[state + 1] += first[state]
-    place, predecessors = first.copy(), np.empty(first[-1], np.int32)
-    for state in range(n_states):
-        for action in range(n_actions):
-            if allowed[state, action]:
-                for k in range(n_outcomes):
-                    if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                        reached = next_state[state, action, k]
-                        predecessors[place[reached]] = state
-                        place[reached] += 1
-    return first, predecessors
-
-
-@compiled
 def _search_backwards(
-    first: Ints, predecessors: AnyInts, steps: Ints, order: Ints, found: int
+    leads: Bools, next_state: AnyInts, steps: Ints, order: Ints, found: int
 ) -> int:
     """Breadth-first search from the first ``found`` states of ``order``; the number then found."""
+    flat, reached, n_each = leads.ravel(), next_state.ravel(), leads[0].size
+    # The outcomes that lead to each state: the first one, and after each outcome the next one.
+    first, following = np.full(len(steps), -1, np.int32), np.empty(flat.size, np.int32)
+    for outcome in range(flat.size - 1, -1, -1):
+        if flat[outcome]:
+            following[outcome] = first[reached[outcome]]
+            first[reached[outcome]] = outcome
     done = 0
     while done < found:
-        reached = order[done]
-        done += 1
-        for i in range(first[reached], first[reached + 1]):
-            state = predecessors[i]
+        outcome = first[order[done]]
+        while outcome >= 0:
+            state = outcome // n_each
             if steps[state] < 0:
-                steps[state] = steps[reached] + 1
+                steps[state] = steps[order[done]] + 1
                 order[found] = state
                 found += 1
+            outcome = following[outcome]
+        done += 1
     return found
 
 

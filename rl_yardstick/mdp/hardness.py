@@ -23,7 +23,7 @@ from rl_yardstick.mdp.evaluation import (
 from rl_yardstick.mdp.finite_horizon import FiniteHorizonPlan, back_up, finite_horizon_optimum
 from rl_yardstick.mdp.graph import steps_to_end
 from rl_yardstick.mdp.planning import action_value, policy_iteration, surely_ending
-from rl_yardstick.mdp.transition_model import AnyInts, Bools, Dynamics, Floats, TransitionModel
+from rl_yardstick.mdp.transition_model import Bools, Dynamics, Floats, TransitionModel
 
 # Above these limits, a measure is None. Outcomes of reachable states, times these states.
 MOST_FOR_DIAMETER = 5_000_000
@@ -218,23 +218,26 @@ def looking_ahead(model: TransitionModel, horizon: int) -> tuple[int | None, flo
         do not suffice; the bound also where transitions or rewards are random, or there is only
         one action.
     """
-    states = np.flatnonzero(model.reachable)
-    place = np.cumsum(model.reachable) - 1
-    rows = model.prob[states], place[model.next_state[states]], model.terminated[states]
-    arrays = (*rows, model.expected_reward[states])
-    start = model.initial[states] > 0
-    steps = _longest_episode(*rows, start, horizon)
-    deepest = min(steps, MOST_LOOKED_AT // (steps * rows[0].size))
-    if steps * len(states) > MOST_VALUES or deepest < min(steps, LEAST_DEPTHS):
+    n_states, n_actions = int(model.reachable.sum()), model.n_actions
+    steps = _longest_episode(model, min(horizon, MOST_VALUES // n_states + 1))
+    size = steps * n_states * n_actions * model.n_outcomes
+    deepest = min(steps, MOST_LOOKED_AT // size)
+    if steps * n_states > MOST_VALUES or deepest < min(steps, LEAST_DEPTHS):
         return None, None
-    best, worst, current = _value_rows(arrays, steps)
-    n_actions, order = model.n_actions, np.arange(len(states))
-    everything, actions = np.ones(rows[0].shape[:2], np.bool_), np.zeros(len(states), np.uint64)
-    is_random = ((rows[0] > 0).sum(axis=2) > 1).any() or model.reward_variance is not None
-    bounded = n_actions > 1 and not is_random
+    # Highest and lowest values, and those of random actions, with 0, 1, ... steps left.
+    best, worst, current = (np.zeros((steps + 1, model.n_states)) for _ in range(3))
+    for left in range(1, steps + 1):
+        best[left] = model.action_values(best[left - 1]).max(axis=1)
+        worst[left] = model.action_values(worst[left - 1]).min(axis=1)
+        current[left] = model.action_values(current[left - 1]).mean(axis=1)
+    is_random = ((model.prob > 0).sum(axis=2) > 1)[model.reachable].any()
+    bounded = n_actions > 1 and not is_random and model.reward_variance is None
+    dynamics, start, states = model.dynamics, model.initial > 0, np.flatnonzero(model.reachable)
+    everything, actions = model.allowed_actions(), np.zeros(model.n_states, np.uint64)
     lookahead, bound = None, float(steps)
     for k in range(1, deepest + 1):
-        solves, spread = _greedy_is_optimal(arrays, start, best, worst, current, OPTIMAL_TOLERANCE)
+        rows = best, worst, current
+        solves, spread = _greedy_is_optimal(dynamics, start, *rows, OPTIMAL_TOLERANCE)
         if solves and lookahead is None:
             lookahead = k
         if bounded and np.isfinite(spread):
@@ -245,48 +248,19 @@ def looking_ahead(model: TransitionModel, horizon: int) -> tuple[int | None, flo
             break
         # A sweep of value iteration, in place: with each number of steps left from one step fewer.
         for left in range(steps, 0, -1):
-            back_up(arrays, everything, 1.0, order, current[left - 1], current[left], actions)
+            later, now = current[left - 1], current[left]
+            back_up(dynamics, everything, 1.0, states, later, now, actions)
     return lookahead, bound if bounded and lookahead is not None else None
 
 
-@compiled
-def _longest_episode(
-    prob: Floats, next_state: AnyInts, terminated: Bools, start: Bools, horizon: int
-) -> int:
+def _longest_episode(model: TransitionModel, horizon: int) -> int:
     """The largest number of steps that an episode can have, at most the time limit."""
-    here = start.copy()
+    here = model.initial > 0
     for step in range(1, horizon):
-        there = np.zeros(len(start), np.bool_)
-        goes_on = False
-        for state in range(prob.shape[0]):
-            if here[state]:
-                for action in range(prob.shape[1]):
-                    for k in range(prob.shape[2]):
-                        if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                            there[next_state[state, action, k]] = True
-                            goes_on = True
-        if not goes_on:
+        here = model.after(np.repeat(here[:, None], model.n_actions, axis=1))
+        if not here.any():
             return step
-        here = there
     return horizon
-
-
-@compiled
-def _value_rows(model: Dynamics, horizon: int) -> tuple[Floats, Floats, Floats]:
-    """Highest and lowest values, and those of random actions, with 0, 1, ... steps left."""
-    n_states, n_actions = model[3].shape
-    best = np.zeros((horizon + 1, n_states))
-    worst, mean = best.copy(), best.copy()
-    for left in range(1, horizon + 1):
-        for state in range(n_states):
-            highest, lowest, total = -np.inf, np.inf, 0.0
-            for action in range(n_actions):
-                highest = max(highest, action_value(model, state, action, best[left - 1], 1.0))
-                lowest = min(lowest, action_value(model, state, action, worst[left - 1], 1.0))
-                total += action_value(model, state, action, mean[left - 1], 1.0)
-            best[left, state], worst[left, state] = highest, lowest
-            mean[left, state] = total / n_actions
-    return best, worst, mean
 
 
 @compiled

@@ -181,11 +181,12 @@ def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
     shape, groups = found.policy.shape, found.groups
     order = count()  # breaks ties, so that arrays are never compared
     heap: list[tuple[float, int, Floats, Floats]] = []
-    n_slopes = 2 * len(seen) * shape[1]
+    n_slopes, nothing = 2 * len(seen) * shape[1], np.zeros((1, model.n_states))
 
     def add(low: Floats, high: Floats, most: float) -> None:
         nonlocal work
-        values = _return_in_box(model.dynamics, states, groups, low, high, horizon)
+        box = states, low[groups], high[groups]
+        values = _returns_in_box(model.dynamics, *box, nothing, horizon)
         most = min(most, float(model.initial @ values))
         work -= 1
         if most > enough and work >= n_slopes:
@@ -225,12 +226,13 @@ def _bound_by_slopes(
     policy = middle[groups]
     values, advantages = _advantages(model.dynamics, states, policy, horizon)
     bound = float(model.initial @ values)
+    free = (*model.dynamics[:3], np.zeros_like(model.expected_reward))  # without rewards
+    box = states, low[groups], high[groups]
     for group in seen:
         for action in range(model.n_actions):
-            more = np.ascontiguousarray(advantages[:, :, action])
-            box = states, groups, low, high, group
+            more = np.where(groups == group, advantages[:, :, action], 0.0)
             up, down = (
-                float(model.initial @ _most_met(model.dynamics, *box, each))
+                float(model.initial @ _returns_in_box(free, *box, each, horizon))
                 for each in (more, -more)
             )
             rises, falls = (high - middle)[group, action], (middle - low)[group, action]
@@ -252,24 +254,26 @@ def _inside(low: Floats, high: Floats) -> Floats:
 
 
 @compiled
-def _return_in_box(
-    model: Dynamics, states: Ints, groups: Ints, low: Floats, high: Floats, horizon: int
+def _returns_in_box(
+    model: Dynamics, states: Ints, low: Floats, high: Floats, extra: Floats, horizon: int
 ) -> Floats:
-    """The returns (S,) of an agent that sees the state and chooses within the box at each step."""
-    prob, mean_reward = model[0], model[3]
+    """The returns (S,) of an agent that sees the state and chooses within the box at each step.
+
+    The box has shape (S, A). It receives ``extra`` (1 or horizon, S), at each step in each state.
+    """
+    prob = model[0]
     later, now = np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
     values, is_used = np.zeros(prob.shape[1]), np.zeros(prob.shape[1], np.bool_)
-    for _ in range(horizon):
+    for step in range(horizon - 1, -1, -1):
         changed = False
         for state in states:
-            _look_ahead(model, state, later, values)
             for action in range(prob.shape[1]):
-                values[action] += mean_reward[state, action]
-            group = groups[state]
-            now[state] = _best_in_box(values, low[group], high[group], is_used)
+                values[action] = action_value(model, state, action, later, 1.0)
+            now[state] = _best_in_box(values, low[state], high[state], is_used)
+            now[state] += extra[min(step, len(extra) - 1), state]
             changed = changed or now[state] != later[state]
         now, later = later, now
-        if not changed:
+        if not changed and len(extra) == 1:
             break
     return later
 
@@ -303,57 +307,19 @@ def _advantages(
     model: Dynamics, states: Ints, policy: Floats, horizon: int
 ) -> tuple[Floats, Floats]:
     """The returns (S,) of a policy (S, A), and its advantages (horizon, S, A)."""
-    mean_reward = model[3]
     n_states, n_actions = policy.shape
     advantages, values = np.zeros((horizon, n_states, n_actions)), np.zeros(n_actions)
     later, now = np.zeros(n_states), np.zeros(n_states)
     for step in range(horizon - 1, -1, -1):
         for state in states:
-            _look_ahead(model, state, later, values)
             now[state] = 0.0
             for action in range(n_actions):
-                values[action] += mean_reward[state, action]
+                values[action] = action_value(model, state, action, later, 1.0)
                 now[state] += policy[state, action] * values[action]
             for action in range(n_actions):
                 advantages[step, state, action] = values[action] - now[state]
         now, later = later, now
     return later, advantages
-
-
-@compiled
-def _most_met(
-    model: Dynamics,
-    states: Ints,
-    groups: Ints,
-    low: Floats,
-    high: Floats,
-    group: int,
-    rewards: Floats,
-) -> Floats:
-    """As `_return_in_box`, for rewards (horizon, S) received in states of ``group`` alone."""
-    prob = model[0]
-    later, now = np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
-    values, is_used = np.zeros(prob.shape[1]), np.zeros(prob.shape[1], np.bool_)
-    for step in range(len(rewards) - 1, -1, -1):
-        for state in states:
-            _look_ahead(model, state, later, values)
-            of = groups[state]
-            now[state] = _best_in_box(values, low[of], high[of], is_used)
-            if of == group:
-                now[state] += rewards[step, state]
-        now, later = later, now
-    return later
-
-
-@called
-def _look_ahead(model: Dynamics, state: int, later: Floats, values: Floats) -> None:
-    """Write the expected value after each action of a state into ``values``."""
-    prob, next_state, terminated, _ = model
-    for action in range(prob.shape[1]):
-        values[action] = 0.0
-        for k in range(prob.shape[2]):
-            if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                values[action] += prob[state, action, k] * later[next_state[state, action, k]]
 
 
 @called

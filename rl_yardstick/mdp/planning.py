@@ -225,11 +225,10 @@ def surely_ending(model: TransitionModel, allowed: Bools, resting: Bools) -> tup
 
     Removes states without a path there, and actions that may lead to them, until nothing changes.
     """
-    leads = (model.prob > 0) & ~model.terminated
     while True:
         steps, _ = steps_to_end(model, allowed, resting)
         good = steps >= 0
-        risky = allowed & (leads & ~good[model.next_state]).any(axis=2)
+        risky = allowed & (model.goes_on & ~good[model.next_state]).any(axis=2)
         dead = allowed & ~good[:, None]
         if not (risky | dead).any():
             return good, allowed
@@ -368,37 +367,41 @@ class PlanningProblem:
         The linear system is solved by BiCGSTAB (van der Vorst, 1992), with a sweep as
         preconditioner, to a hundredth of the residual. Needs a discount below one.
         """
+        from scipy.sparse import csr_array
         from scipy.sparse.linalg import LinearOperator, bicgstab
 
         rows = policy_rows(self.model.dynamics, self.discount, order, policy)
         weight, following, reward, _ = rows
-        n = len(order)
-        stays = following == np.arange(n)[:, None]
-        diagonal = 1.0 - np.where(stays, weight, 0.0).sum(axis=1)
-        nothing = np.zeros(n)
+        n, ends = len(order), np.arange(0, weight.size + 1, weight.shape[1])
+        moves = csr_array((weight.ravel(), following.ravel(), ends), shape=(n, n))
+        diagonal = 1 - moves.diagonal()
 
         def sweep(right: Floats) -> Floats:
             found = np.zeros(n)
             evaluate(weight, following, right, diagonal, found)
             return found
 
-        missing = residuals(weight, following, reward, values[order])
+        missing = reward - values[order] + moves @ values[order]
         change, _ = bicgstab(
-            LinearOperator(
-                (n, n), lambda v: -residuals(weight, following, nothing, v), dtype=np.float64
-            ),
+            LinearOperator((n, n), lambda v: v - moves @ v, dtype=np.float64),
             missing,
             rtol=ACCURACY_OF_SOLUTIONS,
             maxiter=MOST_KRYLOV_STEPS,
             M=LinearOperator((n, n), sweep, dtype=np.float64),
         )
         found = values[order] + change
-        if np.abs(residuals(weight, following, reward, found)).max() <= np.abs(missing).max():
+        if np.abs(reward - found + moves @ found).max() <= np.abs(missing).max():
             values[order] = found
 
     def action_values(self, values: Floats) -> Floats:
         """Values of shape (S, A), minus infinity for actions that are not allowed."""
-        return _action_values(self.model.dynamics, self.part.allowed, self.discount, values)
+        model = self.model
+        following = np.where(model.goes_on, values[model.next_state], 0.0)
+        found = model.expected_reward.copy()
+        # In this order, the sums are those of the compiled sweeps, to the last bit.
+        for k in range(model.n_outcomes):
+            found += self.discount * model.prob[:, :, k] * following[:, :, k]
+        return np.where(self.part.allowed, found, -np.inf)
 
     def rounding(self, values: Floats) -> float:
         """The change of a value that rounding alone may make in one sweep."""
@@ -460,6 +463,18 @@ def action_value(model: Dynamics, state: int, action: int, later: Floats, discou
         if prob[state, action, k] > 0 and not terminated[state, action, k]:
             value += discount * prob[state, action, k] * later[next_state[state, action, k]]
     return value
+
+
+@called
+def pass_on(model: Dynamics, state: int, action: int, weight: float, there: Floats) -> float:
+    """Move a state's probability to its successors in ``there``; returns the part that goes on."""
+    prob, next_state, terminated, _ = model
+    left = 0.0
+    for k in range(prob.shape[2]):
+        if prob[state, action, k] > 0 and not terminated[state, action, k]:
+            there[next_state[state, action, k]] += weight * prob[state, action, k]
+            left += weight * prob[state, action, k]
+    return left
 
 
 @compiled
@@ -547,7 +562,6 @@ def first_guess(
         known[state] = True
 
 
-@compiled
 def policy_rows(
     model: Dynamics, discount: float, order: Ints, policy: Ints
 ) -> tuple[Floats, NDArray[np.int32], Floats, Floats]:
@@ -560,27 +574,20 @@ def policy_rows(
         minus the weight of states at the same or a later index, (n,).
     """
     prob, next_state, terminated, mean_reward = model
-    n_outcomes = prob.shape[2]
-    place_of = np.full(prob.shape[0], -1, np.int32)
-    for place in range(len(order)):
-        place_of[order[place]] = place
-    weight = np.zeros((len(order), n_outcomes))
-    following = np.zeros((len(order), n_outcomes), np.int32)
-    reward = np.empty(len(order))
+    here, taken = np.arange(len(order), dtype=np.int32), order * prob.shape[1] + policy[order]
+    place = np.full(len(prob), -1, np.int32)
+    place[order] = here
+    # Taken from flat arrays, which is twice as fast as by two indices.
+    chance, reached, ends = (
+        array.reshape(-1, prob.shape[2]).take(taken, axis=0)
+        for array in (prob, next_state, terminated)
+    )
+    following = place.take(reached)
+    weight = discount * chance * ~(ends | (following < 0))
     settled = np.ones(len(order))
-    for place in range(len(order)):
-        state = order[place]
-        action = policy[state]
-        reward[place] = mean_reward[state, action]
-        for k in range(n_outcomes):
-            leads = prob[state, action, k] > 0 and not terminated[state, action, k]
-            target = place_of[next_state[state, action, k]]
-            if leads and target >= 0:
-                weight[place, k] = discount * prob[state, action, k]
-                following[place, k] = target
-                if target >= place:
-                    settled[place] -= weight[place, k]
-    return weight, following, reward, settled
+    for k in range(weight.shape[1]):
+        settled -= np.where(following[:, k] >= here, weight[:, k], 0.0)
+    return weight, np.maximum(following, 0), mean_reward.take(taken), settled
 
 
 @compiled
@@ -602,32 +609,3 @@ def evaluate(
         values[place] += change
         largest = max(largest, abs(change))
     return largest
-
-
-@compiled
-def residuals(
-    weight: Floats, following: NDArray[np.int32], reward: Floats, values: Floats
-) -> Floats:
-    """The Bellman residual of each row of a policy, shape (n,)."""
-    result = np.empty(len(reward))
-    for place in range(len(reward)):
-        value = reward[place] - values[place]
-        for k in range(weight.shape[1]):
-            value += weight[place, k] * values[following[place, k]]
-        result[place] = value
-    return result
-
-
-@compiled
-def _action_values(model: Dynamics, allowed: Bools, discount: float, values: Floats) -> Floats:
-    """The action values, shape (S, A), that follow from the state values ``values``.
-
-    Actions that are not allowed get minus infinity.
-    """
-    prob, mean_reward = model[0], model[3]
-    result = np.full(mean_reward.shape, -np.inf)
-    for state in range(prob.shape[0]):
-        for action in range(prob.shape[1]):
-            if allowed[state, action]:
-                result[state, action] = action_value(model, state, action, values, discount)
-    return result

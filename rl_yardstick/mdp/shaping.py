@@ -148,7 +148,7 @@ def effect_under_limit(original: TransitionModel, shaped: TransitionModel, horiz
     differs, here = np.zeros(original.n_states, np.bool_), original.initial > 0
     for optimal, theirs, _, _ in in_time:
         differs |= here & (optimal != theirs).any(axis=1)
-        here = _following(original, here, optimal)
+        here = original.after(here[:, None] & optimal)
     optimum, _, best_return, worst_return = (float(original.initial @ each) for each in values)
     ends, policies = (best_return, worst_return), zip(*in_time, strict=True)
     _, _, policy, worst_policy = (np.array(each) for each in policies)
@@ -171,14 +171,6 @@ def _best(action_values: Floats) -> Bools:
     best = action_values.max(axis=1, keepdims=True)
     margin = np.maximum(EQUAL * np.abs(best), EQUAL_NEAR_ZERO * np.abs(action_values).max())
     return np.asarray(action_values >= best - margin)
-
-
-def _following(model: TransitionModel, here: Bools, actions: Bools) -> Bools:
-    """The states that the actions may lead to from some states, bool of shape (S,)."""
-    goes_on = (model.prob > 0) & ~model.terminated & (here[:, None] & actions)[:, :, None]
-    there = np.zeros(model.n_states, np.bool_)
-    there[model.next_state[goes_on]] = True
-    return there
 
 
 def _potential(

@@ -150,9 +150,20 @@ class TransitionModel:
         """The mean reward of one step, shape (S, A)."""
         return _read_only(np.einsum("sak,sak->sa", self.prob, self.reward))
 
+    @cached_property
+    def goes_on(self) -> Bools:
+        """The possible outcomes that do not end the episode, bool of shape (S, A, K)."""
+        return _read_only((self.prob > 0) & ~self.terminated)
+
+    def after(self, actions: Bools) -> Bools:
+        """The states that actions, bool of shape (S, A), may lead to; bool of shape (S,)."""
+        found = np.zeros(self.n_states, np.bool_)
+        found[self.next_state[self.goes_on & actions[:, :, None]]] = True
+        return found
+
     def action_values(self, later: Floats) -> Floats:
         """The undiscounted action values, shape (S, A), from the state values one step later."""
-        following = np.where(self.terminated, 0.0, later[self.next_state])
+        following = np.where(self.goes_on, later[self.next_state], 0.0)
         values: Floats = self.expected_reward + np.einsum("sak,sak->sa", self.prob, following)
         return values
 
@@ -167,7 +178,7 @@ class TransitionModel:
 
     def reached_by(self, allowed: Bools) -> Bools:
         """The states that ``allowed`` actions, bool of shape (S, A), visit; bool of shape (S,)."""
-        leads = (self.prob > 0) & ~self.terminated & allowed[:, :, None]
+        leads = self.goes_on & allowed[:, :, None]
         found = self.initial > 0
         new = np.flatnonzero(found)
         while len(new):

@@ -13,15 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rl_yardstick.verdicts.estimates import (
-    FEW,
-    SAME,
     UNBOUNDED,
     Bounds,
     Estimate,
     Floats,
+    mean_over_runs,
     median_over_runs,
     share_interval,
-    t_reach,
 )
 
 
@@ -80,20 +78,8 @@ def curve_band(values: ArrayLike, bounds: Bounds = UNBOUNDED) -> Band:
 
     ``values`` are of shape (n_runs, n_points); non-finite ones are left out at their point.
     """
-    table = np.asarray(values, np.float64)
-    known = np.isfinite(table)
-    table, n = np.where(known, table, np.nan), known.sum(axis=0)
-    least, most = np.fmin.reduce(table), np.fmax.reduce(table)
-    # Relative to the smallest value, so that the mean of equal values is exact.
-    above = np.where(known, table - least, 0.0)
-    offset = above.sum(axis=0) / np.maximum(n, 1)
-    equal = most - least <= SAME * np.maximum(1.0, np.abs(most))
-    mean = np.where(equal, least, least + offset)
-    squares = (np.where(known, above - offset, 0.0) ** 2).sum(axis=0)
-    reach = t_reach(np.maximum(n, 2), np.where(equal, 0.0, squares / np.maximum(n - 1, 1)))
-    low = np.where(n < FEW, least, np.minimum(mean, np.maximum(mean - reach, bounds[0])))
-    high = np.where(n < FEW, most, np.maximum(mean, np.minimum(mean + reach, bounds[1])))
-    return Band(mean, low, high)
+    points = [mean_over_runs(column, bounds) for column in np.transpose(values)]
+    return Band(*np.reshape([(each.point, each.low, each.high) for each in points], (-1, 3)).T)
 
 
 def steps_to_threshold(

@@ -74,11 +74,9 @@ def mean_and_variance(runs: Floats) -> tuple[float, float]:
     return float(runs.mean()), float(runs.var(ddof=1))
 
 
-def t_reach(n: ArrayLike, variance: ArrayLike, level: float = LEVEL) -> Floats:
-    """Half the length of Student's t interval of a mean, elementwise; n is at least 2."""
-    runs = np.asarray(n, np.float64)
-    quantile = special.stdtrit(runs - 1, 1 - level / 2)
-    return np.asarray(quantile * np.sqrt(np.asarray(variance) / runs))
+def t_reach(n: float, variance: float, level: float = LEVEL) -> float:
+    """Half the length of Student's t interval of a mean; n is at least 2."""
+    return float(special.stdtrit(n - 1, 1 - level / 2) * np.sqrt(variance / n))
 
 
 def mean_over_runs(values: ArrayLike, bounds: Bounds = UNBOUNDED) -> Estimate:
@@ -90,7 +88,7 @@ def mean_over_runs(values: ArrayLike, bounds: Bounds = UNBOUNDED) -> Estimate:
         return Estimate(mean, mean, mean, n, n_missing)
     if n < FEW:
         return Estimate(mean, float(runs.min()), float(runs.max()), n, n_missing)
-    reach = float(t_reach(n, variance))
+    reach = t_reach(n, variance)
     low, high = max(mean - reach, bounds[0]), min(mean + reach, bounds[1])
     # A figure outside of the bounds, by rounding or by wrong bounds, keeps its place.
     return Estimate(mean, min(low, mean), max(high, mean), n, n_missing)

@@ -34,7 +34,7 @@ class Sample(NamedTuple):
         """Student's t interval of the mean, cut at the bounds."""
         if self.n < 2:
             return ends
-        reach = float(t_reach(self.n, self.variance, level))
+        reach = t_reach(self.n, self.variance, level)
         return max(self.mean - reach, ends[0]), min(self.mean + reach, ends[1])
 
 

@@ -13,7 +13,7 @@ from rl_yardstick.envs.argument_checks import (
     check_number,
     check_whole_number,
 )
-from rl_yardstick.envs.grid import MOVES, GridDynamics, GridMap, GridWorld, MapEnv, Tile
+from rl_yardstick.envs.grid import MOVES, GridWorld, MapEnv, Tile
 from rl_yardstick.mdp.transition_model import TransitionModel
 
 # The windy field.
@@ -257,11 +257,8 @@ class DynaMazeEnv(GridWorld):
     def _change(self, rows: tuple[str, ...]) -> None:
         """Replace the maze by another one, between two steps."""
         self._becomes = None
-        passable = [letter for letter, tile in self._tiles.items() if not tile.blocked]
-        self.map = GridMap.read(rows, self._tiles, passable)
-        self.rows = self.map.rows
         edge, slip = self.dynamics.edge, 1 - self.dynamics.outcome_prob[0]
-        self.dynamics = GridDynamics(self.map, self._tiles, edge, slip)
+        self._set_map(rows, self._tiles, edge, slip)
         for worked_out in ("P", "initial_state_distrib", "_starts"):
             self.__dict__.pop(worked_out, None)
         # The next picture is of another map.

@@ -173,10 +173,9 @@ def _arrivals(rows: tuple[str, ...]) -> tuple[Ints, Bools]:
 def _new_velocities(is_start: Bools) -> Ints:
     """The velocity after each action, by cell and velocity, shape (cells, 25, 9)."""
     velocity, action = np.arange(N_SPEEDS**2)[:, None], np.arange(9)
-    parts = []
-    for part, change in zip(np.divmod(velocity, N_SPEEDS), np.divmod(action, 3), strict=True):
-        parts.append(np.clip(part + change - 1, 0, N_SPEEDS - 1))
-    wanted = parts[0] * N_SPEEDS + parts[1]
+    parts = zip(np.divmod(velocity, N_SPEEDS), np.divmod(action, 3), strict=True)
+    up, right = (np.clip(part + change - 1, 0, N_SPEEDS - 1) for part, change in parts)
+    wanted = up * N_SPEEDS + right
     stops = (wanted == 0) & ~is_start[:, None, None]
     return np.where(stops, velocity, wanted)
 
