@@ -238,6 +238,12 @@ class OfDQN:
         if self.is_online:
             return
         settings = {"learning_starts": 10, "buffer_size": 200, "train_freq": 1}
+        model, _ = new_model(self.subject, target_update_interval=10**9, **settings)
+        before = parameters_of(model.q_net_target)
+        by_user(model.learn, 40)
+        after = parameters_of(model.q_net_target)
+        if (after != before).any() and (after != parameters_of(model.q_net)).any():
+            return  # it mixes them by a rule of its own
         faults = ("target-mixed-wrongly", "target-never-copied", "target-always-copied")
         for interval, n, fault in zip((1, 10, 10**9), (5, 40, 40), faults, strict=True):
             share = TAU if n == 5 else 1.0
