@@ -145,6 +145,8 @@ class NumpyDraws:
     def _each(self, draw: Callable[..., Any], size: Any, *given: Any, dtype: Any = int) -> Any:
         """One draw, or an array of draws, with parameters that may be arrays."""
         self._script.visit()
+        if size is None and not any(map(np.ndim, given)):
+            return np.asarray(draw(*given), dtype)[()]
         shaped = np.zeros(() if size is None else size)
         drawn = np.frompyfunc(lambda _, *given: draw(*given), 1 + len(given), 1)(shaped, *given)
         return np.asarray(drawn, dtype)[()]

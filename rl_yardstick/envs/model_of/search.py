@@ -291,7 +291,7 @@ class Search:
     def _tick(self) -> None:
         """Watch the time, and now and then the constants."""
         self.runs += 1
-        if self.spent > self.seconds:
+        if self.runs % 8 == 0 and self.spent > self.seconds:
             done = f"{len(self.saved):,} states found, {len(self.rows):,} of them done; "
             done = done * bool(self.rows) + self._growing()
             raise Limit(f"no end after {self.seconds:g} seconds: {done}")

@@ -95,6 +95,11 @@ def short(value: Any, depth: int = 2) -> Any:
     return [short(part, depth - 1) for part in value]
 
 
+def is_plain_array(value: Any) -> bool:
+    """Whether a value is an array of numbers."""
+    return type(value) is np.ndarray and not value.dtype.hasobject
+
+
 class ByValue(pickle.Pickler):
     """Equal values become equal bytes; which parts are shared counts."""
 
@@ -115,7 +120,7 @@ class ByValue(pickle.Pickler):
         if isinstance(value, NUMBERS):
             return value.now() if isinstance(value, Symbol) else value.item()
         self.seen[i] = len(self.seen), value
-        if kind is np.ndarray and value.dtype != object:
+        if is_plain_array(value):
             return value.dtype.char, value.shape, value.tobytes()
         if self.reference(value) is not None:
             return "generator" if isinstance(value, GENERATORS) else ("object", i)
@@ -291,7 +296,10 @@ class State:
     def key(self, variables: Saved) -> Hashable:
         """The state by value."""
         flat = [pair for own in variables for pair in own.items()]
-        return tuple(flat) if all(isinstance(x, SIMPLE) for _, x in flat) else self.by_value(flat)
+        arrays = {id(x) for _, x in flat if is_plain_array(x)}
+        if len(arrays) + sum(isinstance(x, SIMPLE) for _, x in flat) == len(flat):
+            return tuple((name, self.by_value(x)) for name, x in flat)
+        return self.by_value(flat)
 
     def save(self, variables: Saved) -> bytes:
         """A state to restore, in which constants are the objects that they were."""
@@ -337,6 +345,8 @@ class State:
         """Something hashable that is equal for equal values."""
         if isinstance(value, SIMPLE):
             return value
+        if is_plain_array(value):
+            return value.dtype.char, value.shape, value.tobytes()
         file = io.BytesIO()
         ByValue(file, self).dump(value)
         return file.getvalue()
