@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -165,7 +166,9 @@ class _ByValues:
             return replace(found, state="unreadable", notes=(note,))
         return found
 
-    def _trainings(self, n: int, n_seeds: int, **changes: Any) -> list[_Training]:
+    def _trainings(
+        self, n: int, n_seeds: int, changes: Mapping[str, Any] = MappingProxyType({})
+    ) -> list[_Training]:
         found = []
         for seed in range(1, 1 + n_seeds):
             trained, begun = (self.subject.train(steps, seed, **changes) for steps in (n, 3))
@@ -226,14 +229,14 @@ class _ByValues:
         length = self.subject.named(*ROLLOUTS)
         with suppress(CannotTrain):  # it may not be made for such settings
             if rates and rule != "states":
-                [(q, _, d, _)] = self._trainings(self.length // 2, 1, **rates)
+                [(q, _, d, _)] = self._trainings(self.length // 2, 1, rates)
                 is_clear = (d.weight > 0) & (np.ptp(q, axis=1)[d.state] > 0.3)
                 share = float(np.mean((q[d.state, d.action] < q.max(axis=1)[d.state])[is_clear]))
                 if share > 0.25:
                     told = f"{share:.0%} of its actions are not its best"
                     return "exploration-inverted", f"with {' and '.join(rates)} at 0, {told}"
             if length:
-                [(q, _, d, _)] = short = self._trainings(self.length, 1, **{length: 2})
+                [(q, _, d, _)] = short = self._trainings(self.length, 1, {length: 2})
                 right = next(near for near in nearest(short, rule) if near.name == RIGHT)
                 if right.rms > 1 and any((found := measured(q, d, rule)).off()):
                     return "", f"with {length} at 2, {found.words()}"

@@ -84,6 +84,11 @@ def test_the_best_action_of_the_own_state_is_not_called_another_fault(verdict_on
 def test_settings_do_what_their_names_say(verdict_on):
     found = verdict_on("sarsa", "random() < self.epsilon", "random() > self.epsilon", "_inverted")
     assert found.fault == "exploration-inverted"
+    # Five steps are more than an episode has, and two are not.
+    found = verdict_on("n_step", "0.0 if terminated", "0.0 if not truncated", "_uncut")
+    assert found.lines()[1] == "wrong: no known fault is near"
+    assert "with n at 2, target = " in found.lines()[-1]
+    assert verdict_on("n_step", tag="_right").state == "right"
 
 
 def test_what_training_raises_is_told_and_what_the_audit_raises_is_not_caught(
