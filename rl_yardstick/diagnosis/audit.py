@@ -260,14 +260,14 @@ def _choices(trainings: Sequence[_Training]) -> tuple[str, str] | None:
         text = f"late in training it does the action that pays more in {share:.0%}"
         return None if share > 0.6 else (ACTS_WORSE if share < 0.35 else "", text)
     asked = [
-        np.mean([one.act(state) == BETTER[state] for _ in range(100)])
+        np.mean([one.act(state) == BETTER[state] for _ in range(200)])
         for one in trainings
         for state in (13, 14)
     ]
     low, high = min(asked), max(asked)
-    text = f"it does the action that pays in {low:.0%} to {high:.0%} of 100 times, when evaluated"
+    text = f"it does the action that pays in {low:.0%} to {high:.0%} of 200 times, when evaluated"
     fault = "acts-by-the-worst-value" if high < 0.03 else "explores-in-evaluation"
-    return None if low > 0.97 else (fault, text)
+    return None if low > 0.99 else (fault, text)
 
 
 def _credit(subject: Subject) -> tuple[str, str] | None:

@@ -111,6 +111,9 @@ RULES: Mapping[str, Callable[[Floats, Steps, Ints], Floats]] = {
     "expected": lambda q, d, states: (
         (1 - d.exploration) * q[states].max(axis=1) + d.exploration * q[states].mean(axis=1)
     ),
+    "expectation-below-1": lambda q, d, states: (
+        (1 - d.exploration) * q[states].max(axis=1) + d.exploration * q[states].min(axis=1) / 2
+    ),
     "smallest": lambda q, d, states: q[states].min(axis=1),
     "mean": lambda q, d, states: q[states].mean(axis=1),
     "sum": lambda q, d, states: q[states].sum(axis=1),
@@ -225,6 +228,8 @@ def _of_actions(d: Steps, rule: str, own: Floats, first: Floats) -> Iterator[Can
     right = BACKUPS[RIGHT]
     for wrong in RULES:
         is_same = {wrong, rule} <= {"next", "expected"} or wrong == rule
+        if wrong == "expectation-below-1" and rule != "expected":
+            continue
         if not (is_same or (wrong == "mean" and rule != "largest" and d.exploration[-1] > 0.8)):
             yield solve(name_of_rule(wrong), right, d, wrong, own)
     other = copy.copy(d)

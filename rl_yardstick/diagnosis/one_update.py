@@ -7,6 +7,7 @@ log-probabilities, each times an error. The world's own log gives the errors of 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -234,32 +235,43 @@ class OfDQN:
         yield f"{RIGHT} (absolute)", np.sign(targets[RIGHT] - own) @ self.slopes[self.cells]
 
     def _copied(self) -> Iterator[Found]:
-        """Whether the target network moves when it should, and how far."""
+        """Whether the target network is copied when it should be, and mixed as it should be."""
         if self.is_online:
             return
-        settings = {"learning_starts": 10, "buffer_size": 200, "train_freq": 1}
-        model, _ = new_model(self.subject, target_update_interval=10**9, **settings)
+        model, _ = new_model(self.subject, target_update_interval=1, tau=TAU, learning_starts=10)
+        by_user(model.learn, 5)  # nothing is learnt yet: the networks are the same
         before = parameters_of(model.q_net_target)
-        by_user(model.learn, 40)
-        after = parameters_of(model.q_net_target)
-        if (after != before).any() and (after != parameters_of(model.q_net)).any():
-            return  # it mixes them by a rule of its own
-        faults = ("target-mixed-wrongly", "target-never-copied", "target-always-copied")
-        for interval, n, fault in zip((1, 10, 10**9), (5, 40, 40), faults, strict=True):
-            share = TAU if n == 5 else 1.0
-            mine = {"target_update_interval": interval, "tau": share, **settings}
-            model, _ = new_model(self.subject, **mine)
-            before = parameters_of(model.q_net_target)
-            by_user(model.learn, n)
-            if n == 5:  # nothing is learnt yet: the networks are the same
-                one_more = th.as_tensor(before + 1).float()
-                th.nn.utils.vector_to_parameters(one_more, model.q_net.parameters())
-                by_user(model._on_step)
-            moved = float(np.abs(parameters_of(model.q_net_target) - before).mean())
-            is_right = (moved == 0) == (interval == 10**9)
-            if not is_right or (n == 5 and abs(moved - TAU) > 1e-3):
-                name = "target-never-copied" if moved == 0 else fault
-                yield name, f"the target network moves by {moved:.3g} within {n} steps"
+        one_more = th.as_tensor(before + 1).float()
+        th.nn.utils.vector_to_parameters(one_more, model.q_net.parameters())
+        by_user(model._on_step)
+        moved = float(np.abs(parameters_of(model.q_net_target) - before).mean())
+        if min(abs(moved - each) for each in (TAU, 0, 1)) > 1e-3:  # some always copy all of it
+            yield "target-mixed-wrongly", f"the target network moves by {moved:.3g}, tau is {TAU}"
+        right = range(3, 5)  # copies of a network that learns from the 11th step on, in 45 steps
+        for interval, wanted in ((10, right), (10**9, range(1))):
+            copies, others = self._changes_of_target(interval)
+            if others:
+                return  # it mixes them by a rule of its own
+            if copies not in wanted:
+                name = "target-always-copied" if copies >= wanted.stop else "target-never-copied"
+                told = f"the target network is copied {copies} times in 45 steps"
+                yield name, f"{told} where target_update_interval is {interval}"
+
+    def _changes_of_target(self, interval: int) -> tuple[int, int]:
+        """How often the target network becomes the other network in 45 steps, and changes else."""
+        given = {"learning_starts": 10, "buffer_size": 200, "train_freq": 1, "tau": 1.0}
+        model, _ = new_model(self.subject, target_update_interval=interval, **given)
+        seen = list[tuple[Floats, Floats]]()
+
+        def note(*_: Any) -> bool:
+            seen.append((parameters_of(model.q_net), parameters_of(model.q_net_target)))
+            return True
+
+        by_user(model.learn, 45, callback=note)
+        changes = [(old, new) for old, new in pairwise(seen) if (old[1] != new[1]).any()]
+        copies = [(new[1] == net).all() for old, new in changes for net in (old[0], new[0])]
+        n_copies = int(np.reshape(copies, (-1, 2)).any(axis=1).sum())
+        return n_copies, len(changes) - n_copies
 
     def _explored(self) -> Iterator[Found]:
         falls = {"exploration_initial_eps": 0.9, "exploration_final_eps": 0.1}
@@ -284,6 +296,7 @@ class OfActor:
         settings |= {"ent_coef": ENTROPY, "vf_coef": 0.5, "use_rms_prop": False}
         self.model, copies = new_model(subject, **settings)
         self.policy = self.model.policy
+        self.decay = float(self.model.gae_lambda)  # it may set another
         with th.no_grad():
             for each in self.policy.parameters():
                 each.add_(0.3 * th.randn_like(each))
@@ -303,7 +316,7 @@ class OfActor:
     def measured(self) -> Measured:
         """The target's coefficients, from the advantages."""
         d, after = self.steps, np.append(self.advantages[1:], 0.0)
-        told = self.advantages - GAMMA * LAMBDA * (1 - d.over) * after + self.v[d.state]
+        told = self.advantages - GAMMA * self.decay * (1 - d.over) * after + self.v[d.state]
         return fitted(told, parts_of(d, self.v[d.shown]), np.full(self.n, 50.0))
 
     def faults(self) -> Iterator[Found]:
@@ -330,7 +343,7 @@ class OfActor:
     def _advantages(self) -> dict[str, Floats]:
         """The advantages of a rollout, by each formula of targets and of traces."""
         d, found = self.steps, dict[str, Floats]()
-        on, fade, v = 1 - d.over, GAMMA * LAMBDA, next_values(self.v[:, None], d, "")
+        on, fade, v = 1 - d.over, GAMMA * self.decay, next_values(self.v[:, None], d, "")
         keeps = {
             "": fade * on,
             "trace-leaks-into-the-next-episode": fade * (on + d.over),
@@ -338,9 +351,9 @@ class OfActor:
             "done-flag-off-by-one": fade * (1 - d.is_first),
             "lambda-missing": GAMMA * on,
             "lambda-zero": 0 * on,
-            "discount-missing-in-the-trace": LAMBDA * on,
+            "discount-missing-in-the-trace": self.decay * on,
             "discount-twice-in-the-trace": GAMMA * fade * on,
-            "lambda-twice": LAMBDA * fade * on,
+            "lambda-twice": self.decay * fade * on,
         }
         targets = {name: formula(d, v) for name, formula in BACKUPS.items()}
         targets["last-value-missing"] = targets[RIGHT].copy()
