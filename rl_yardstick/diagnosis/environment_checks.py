@@ -30,7 +30,7 @@ from rl_yardstick.pipeline.environment_trial import Finding, Findings, layers_of
 from rl_yardstick.pipeline.errors import UserError, one_line
 
 N_PLAYED, N_LONG, N_SEEDED = 1000, 6000, 120  # steps, as far as they take two seconds
-SLOW, LONG, HUGE = 0.003, 4.0, 1000.0  # seconds of a step, of one that hangs; a reward
+SLOW, LONG, HUGE = 0.003, 3.0, 1000.0  # seconds of a step, of one that hangs; a reward
 LATE = "the checks took too long here"  # what the command exits with after some seconds
 _OF_LIBRARIES = *np.__path__, *gymnasium.__path__, str(Path(__file__).parents[1])
 

@@ -88,7 +88,7 @@ class ClusterWorkers(Workers):
     def _connected(self) -> Client:
         kind, _, number = self.where.partition(":")
         if kind == "local" and number.isdecimal() and int(number) > 0:
-            options = {"threads_per_worker": 1, "dashboard_address": None}
+            options = {"threads_per_worker": 1, "dashboard_address": ":0"}  # any port
             self._cluster = LocalCluster(n_workers=int(number), **options)
         elif self.where.endswith((".yml", ".yaml")):
             self._cluster = _job_queue(Path(self.where), self.n_jobs)

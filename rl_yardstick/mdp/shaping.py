@@ -93,8 +93,8 @@ def discounted_effect(
     everywhere = original.reachable / original.reachable.sum()
     plan = policy_iteration(original, discount)
     shaped_plan = policy_iteration(replace(shaped, initial=everywhere), discount)
-    optimal = _best(plan.action_values)
-    theirs = _best(shaped_plan.action_values) | ~shaped.reachable[:, None]
+    optimal = _best(original, plan.action_values)
+    theirs = _best(shaped, shaped_plan.action_values) | ~shaped.reachable[:, None]
     bad = replace(original, reward=-original.reward)
 
     def judged(mask: Bools) -> Ends:
@@ -133,7 +133,8 @@ def effect_under_limit(original: TransitionModel, shaped: TransitionModel, horiz
             model.action_values(later)
             for model, later in zip((original, shaped, original, original), values, strict=True)
         ]
-        optimal, theirs = _best(found[0]), _best(found[1]) | ~shaped.reachable[:, None]
+        optimal = _best(original, found[0])
+        theirs = _best(shaped, found[1]) | ~shaped.reachable[:, None]
         best, worst = np.where(theirs, found[2], -np.inf), np.where(theirs, found[3], np.inf)
         action = worst.argmin(axis=1)
         is_optimal = np.take_along_axis(optimal, action[:, None], axis=1)[:, 0]
@@ -166,10 +167,11 @@ def _check(original: TransitionModel, shaped: TransitionModel, horizon: int) -> 
         raise ValueError(f"{told[0]} under a limit of {horizon:,} steps are too many to plan")
 
 
-def _best(action_values: Floats) -> Bools:
+def _best(model: TransitionModel, action_values: Floats) -> Bools:
     """The best actions of each state, ties up to rounding included, bool of shape (S, A)."""
     best = action_values.max(axis=1, keepdims=True)
-    margin = np.maximum(EQUAL * np.abs(best), EQUAL_NEAR_ZERO * np.abs(action_values).max())
+    largest = max(np.abs(action_values).max(), np.abs(model.reward).max())
+    margin = np.maximum(EQUAL * np.abs(best), EQUAL_NEAR_ZERO * largest)
     return np.asarray(action_values >= best - margin)
 
 

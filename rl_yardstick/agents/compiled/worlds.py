@@ -412,10 +412,10 @@ def _finite_model(env: Env) -> FiniteModel:
     model = transition_model(env)
     observations = observations_of_states(env)
     check = model_check(env)
-    if check is None:
-        raise NotCompilable("the environment publishes no model")
+    if check is not None and check.refusal is not None:
+        raise NotCompilable(check.refusal)
     if model is None or observations is None:
-        raise NotCompilable(check.refusal or "the environment's transition model is not known")
+        raise NotCompilable("the environment's transition model is not known")
     if model.reward_variance is not None:
         raise NotCompilable("rewards are drawn, and the environment's model holds their means")
     # A wrapper may keep the dynamics but still need every step, for example to film it.
@@ -423,6 +423,8 @@ def _finite_model(env: Env) -> FiniteModel:
     if watching:
         names = ", ".join(sorted(wrapper.__name__ for wrapper in watching))
         raise NotCompilable(f"{names} must see every step")
+    if check is None:
+        raise NotCompilable("the environment publishes no model")
     if not check.state_can_be_set:
         raise NotCompilable("the environment does not continue from the state that s is set to")
     monitor = monitor_of(env)
