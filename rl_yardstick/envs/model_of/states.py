@@ -36,6 +36,7 @@ TRANSPARENT = {"HumanRendering", "Monitor", "OrderEnforcing", "PassiveEnvChecker
 TRANSPARENT |= {"RecordEpisodeStatistics", "RecordVideo", "RenderCollection"}
 NO_STATE = {"_cached_spec", "_np_random_seed", "action_space", "metadata"}
 NO_STATE |= {"observation_space", "render_mode", "spec"}
+MOST_IN_SHORT = 100  # numbers of a constant that is looked at after each step
 PLAYED = 50  # steps of each of the two episodes that are played first
 SIMPLE = (int, float, str, bytes, complex, types.NoneType, np.generic)
 ATOMS = frozenset({*SIMPLE, bool})
@@ -84,15 +85,15 @@ class Clock(Symbol):
         return is_below
 
 
-def short(value: Any, depth: int = 2) -> Any:
-    """What changes with most changes of an object in place, quickly."""
+def short(value: Any, depth: int = 2) -> list[Any]:
+    """Some numbers that change with most changes of an object in place."""
     if isinstance(value, np.ndarray) or not depth:
-        return value.tobytes() if isinstance(value, np.ndarray) else id(value)
+        return [value.tobytes() if isinstance(value, np.ndarray) else id(value)]
     if isinstance(value, dict):
         value = value.values()
     elif not isinstance(value, list | tuple | set | deque):
         value = getattr(value, "__dict__", {}).values()
-    return [short(part, depth - 1) for part in value]
+    return [number for part in value for number in short(part, depth - 1)]
 
 
 def is_plain_array(value: Any) -> bool:
@@ -221,7 +222,8 @@ class State:
         self.kept = self.parts([guessed[place] for place in self.constants])
         self.kept |= {id(layer): layer for layer in self.layers}
         held_fast = [guessed[place] for place in self.constants]
-        self.in_short = [(v, short(v)) for v in held_fast if not isinstance(v, SIMPLE)]
+        shorts = [(v, short(v)) for v in held_fast if not isinstance(v, SIMPLE)]
+        self.in_short = [(v, known) for v, known in shorts if len(known) <= MOST_IN_SHORT]
         self.watched = {p: value for p, value in guessed.items() if p not in self.constants}
         self.clocks = {p: self.counting[p] for p in self.watched if p in self.counting}
         self.fixed = []
