@@ -131,8 +131,8 @@ class Search:
 
     @property
     def spent(self) -> float:
-        """Seconds of processor time, but at least a tenth of those by the clock."""
-        return max(process_time() - self.begun[0], (perf_counter() - self.begun[1]) / 10)
+        """Seconds of processor time, but at least half of those by the clock."""
+        return max(process_time() - self.begun[0], (perf_counter() - self.begun[1]) / 2)
 
     def run(self) -> tuple[TransitionModel, Bools]:
         """The model and the allowed actions, once no guess about the state proves wrong."""
