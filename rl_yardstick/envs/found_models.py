@@ -232,7 +232,7 @@ def _folder() -> Path:
 
 def _read(file: Path) -> FoundModel | NotFound | None:
     """What a file holds; None where there is none, or it cannot be read."""
-    with suppress(OSError, ValueError, KeyError, BadZipFile), np.load(file) as held:
+    with suppress(OSError, ValueError, KeyError, TypeError, BadZipFile), np.load(file) as held:
         arrays = dict(held)
         told = json.loads(str(arrays.pop("told")))
         if "reason" in told:

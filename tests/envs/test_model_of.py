@@ -232,7 +232,9 @@ DRAWS: dict[str, tuple[Callable[[Any], Any], float]] = {
 def test_draws() -> None:
     """Each action is one of the draws, and its value the reward of an episode of one step."""
     rules = [draw for draw, _ in DRAWS.values()]
-    world = World(lambda _, rng, action: (rules[action](rng), True, False), actions=len(rules))
+    world = World(
+        lambda _, rng, action: (rules[action.item()](rng), True, False), actions=len(rules)
+    )
     found = model_of(world, **PATIENT)
     assert found.model.n_states == 1
     means = dict(zip(DRAWS, found.model.expected_reward[0], strict=True))
@@ -378,7 +380,7 @@ def test_a_shift_of_ten_percent_is_caught(shift: float) -> None:
     numbers = {observation: state for state, observation in enumerate(found.observations)}
     for p, refuted in ((found.model.prob, False), (prob, True)):
         model = replace(found.model, prob=p)
-        problem = refutation(env, model, lambda shown, _: numbers.get(shown), found.actions)
+        problem = refutation(env, model, lambda shown, _: numbers.get(shown), range(4))
         assert (problem is not None) == refuted
 
 

@@ -51,7 +51,6 @@ class FoundModel:
     model: TransitionModel
     mask: Bools | None  # actions that raise no error, bool of shape (S, A); None if all
     observations: Any  # what each state shows, in a list
-    actions: list[int]  # of the environment, in the order of the model
     horizon: int | None  # the environment's own limit on steps
     notes: list[str]  # what a reader of the figures should know
     seconds: float
@@ -84,7 +83,7 @@ def model_of(
     space = env.action_space
     if not isinstance(space, gym.spaces.Discrete) or space.n > MOST_ACTIONS:
         raise NotFinite(f"the action space {space} is not `Discrete` with up to {MOST_ACTIONS:,}")
-    actions = [int(space.start + i) for i in range(int(space.n))]
+    actions = [space.start + np.int64(i) for i in range(int(space.n))]  # as Gymnasium draws them
     state = State(env, Script(), ignore)
     search = Search(state, actions, seconds, max_states, progress, starts or ())
     try:
@@ -118,7 +117,7 @@ def model_of(
     for error, pairs in search.illegal.items():
         notes.append(f"{pairs:,} pairs of state and action are not allowed: {error}")
     observations = search.observations * search.times
-    return FoundModel(model, allowed, observations, actions, search.horizon, notes, search.spent)
+    return FoundModel(model, allowed, observations, search.horizon, notes, search.spent)
 
 
 class _Seeded(gym.Wrapper[Any, Any, Any, Any]):
