@@ -78,9 +78,7 @@ def published_model(base: Env) -> PublishedModel | None:
         brings_model = is_trusted(base)  # a subclass could not even be checked
     else:
         has_model = isinstance(getattr(base, "P", None), Mapping)
-        if has_model and not hasattr(base, "initial_state_distrib"):
-            missing = "initial_state_distrib, the probabilities of the starting states, shape (S,)"
-            raise ValueError(f"the environment has P, but not {missing}")
+        has_model &= hasattr(base, "initial_state_distrib")
         # A fickle passenger of Taxi changes his mind outside of P.
         brings_model = has_model and not getattr(base, "fickle_passenger", False)
     if not brings_model:

@@ -114,8 +114,10 @@ def model_of(
     n, seen = len(search.observations), len(set(map(state.by_value, search.observations)))
     if seen < n:
         notes.append(f"{n:,} states stand behind {seen:,} observations")
-    for error, pairs in search.illegal.items():
-        notes.append(f"{pairs:,} pairs of state and action are not allowed: {error}")
+    if illegal := search.illegal:
+        others = f", and {len(illegal) - 1:,} others" * (len(illegal) > 1)
+        told = f"{sum(illegal.values()):,} of the pairs of state and action are not allowed"
+        notes.append(f"{told}: {next(iter(illegal))}{others}")
     observations = search.observations * search.times
     return FoundModel(model, allowed, observations, search.horizon, notes, search.spent)
 

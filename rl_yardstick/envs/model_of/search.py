@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter, process_time
 from typing import Any, NamedTuple
@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rl_yardstick.envs.model_of.draws import CUT_OFF, NEVER, Again, Script, Suspect, take_step
-from rl_yardstick.envs.model_of.states import Refuted, Saved, State
-from rl_yardstick.envs.model_of.symbols import Drawn, Limit, Stop
+from rl_yardstick.envs.model_of.states import Place, Refuted, State
+from rl_yardstick.envs.model_of.symbols import Drawn, Limit, Stop, seconds_since
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 MOST_ENTRIES = 100_000_000  # of the arrays of a model
@@ -131,8 +131,8 @@ class Search:
 
     @property
     def spent(self) -> float:
-        """Seconds of processor time, but at least half of those by the clock."""
-        return max(process_time() - self.begun[0], (perf_counter() - self.begun[1]) / 2)
+        """Seconds, as of `seconds_since`."""
+        return seconds_since(self.begun)
 
     def run(self) -> tuple[TransitionModel, Bools]:
         """The model and the allowed actions, once no guess about the state proves wrong."""
@@ -156,6 +156,8 @@ class Search:
         self.initial = self._starts(self.state.save(self.state.variables()))
         while len(self.rows) < len(self.saved):
             if not any(row := [self._spans(len(self.rows), action) for action in self.actions]):
+                if self.state.clocks:
+                    raise Refuted(next(iter(self.state.clocks)))
                 raise Stop(f"every action fails in a state: {next(iter(self.illegal))}")
             self.rows.append(row)
             often = len(self.rows) == 20 and [len(spans) > 3 for row in self.rows for spans in row]
@@ -164,7 +166,9 @@ class Search:
         self.state.check_constants()
         for outcome in self._starts(self.saved[-1]):  # a reset forgets all
             if outcome not in self.initial:
-                self.refuse_start(self.state.saved(self.saved[outcome.state]))
+                self.refuse_start(self.state.contents(self.state.saved(self.saved[outcome.state])))
+        if not self.seeds:
+            self.refuse_start(self.state.at_first)
 
     def _starts(self, saved: bytes) -> Chances:
         """The chances of what a reset leads to; with seeds, each is as likely."""
@@ -180,19 +184,19 @@ class Search:
             chances[Outcome(self._number(observation, is_reset=True), 0.0)] += 1 / len(self.seeds)
         return chances
 
-    def refuse_start(self, variables: Saved) -> None:
-        """Name the attribute that no start of an episode has."""
+    def refuse_start(self, contents: Iterable[tuple[Place, Hashable]]) -> None:
+        """Name the attribute that has a value which it has in no start of an episode."""
         starts = self._values([self.saved[outcome.state] for outcome in self.initial])
-        for name, value in (pair for own in variables for pair in own.items()):
-            if self.state.by_value(value) not in starts[name]:
-                raise Stop(f"`{name}` is kept over `reset` (ignore it if it changes nothing)")
+        for place, value in contents:
+            if place in starts and value not in starts[place]:
+                raise Stop(f"`{place[1]}` is kept over `reset` (ignore it if it changes nothing)")
 
-    def _values(self, sample: list[bytes]) -> dict[str, set[Hashable]]:
+    def _values(self, sample: list[bytes]) -> dict[Place, set[Hashable]]:
         """The values that each attribute has in these states."""
-        values: dict[str, set[Hashable]] = defaultdict(set)
-        for own in (own for saved in sample for own in self.state.saved(saved)):
-            for name, value in own.items():
-                values[name].add(self.state.by_value(value))
+        values: dict[Place, set[Hashable]] = defaultdict(set)
+        for saved in sample:
+            for place, value in self.state.contents(self.state.saved(saved)):
+                values[place].add(value)
         return values
 
     def _spans(self, state: int, action: Any) -> Spans:
@@ -205,6 +209,8 @@ class Search:
             try:
                 chances = self._outcomes(self.saved[state], action)
             except Exception as error:
+                if time:  # perhaps nothing leads to this state at this time
+                    raise Refuted(next(iter(self.state.clocks))) from None
                 message = f"{type(error).__name__}: {error}"
                 if script.visits:  # no rule of the game: those come before the draws
                     raise Stop(f"{message}, after a random draw") from error
@@ -307,8 +313,8 @@ class Search:
             hint = "" if self.initial else " (optimum --starts 0 1 2 takes three)"
             return f"{what} has more than {self.runs:,} outcomes{hint}"
         values = self._values(sample := self.saved[:: max(1, len(self.saved) // 500)])
-        name = max(values, key=lambda name: len(values[name]), default="state")
-        many = f"`{name}` has {len(values[name])} values in {len(sample)} of them"
+        place = max(values, key=lambda place: len(values[place]), default=(0, "state"))
+        many = f"`{(name := place[1])}` has {len(values[place])} values in {len(sample)} of them"
         return f"{many} (optimum --ignore {name} if it changes nothing)"
 
     def state_now(self, observation: Any, time: int) -> int | None:
@@ -319,7 +325,7 @@ class Search:
             raise Stop(f"`{refuted.args[0][1]}` is changed outside `step`") from None
         number = self.index.get((self.state.key(variables), self.state.by_value(observation)))
         if time == 0 and number is None:
-            self.refuse_start(variables)
+            self.refuse_start(self.state.contents(variables))
         return None if number is None else min(time, self.times - 1) * len(self.rows) + number
 
     @property

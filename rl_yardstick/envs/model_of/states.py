@@ -201,6 +201,7 @@ class State:
             note()
         env.reset(seed=0)
         self.layers[-1].np_random  # noqa: B018 (makes it)
+        self.at_first = values[0]  # attributes by value, after the first reset of all
         self.counting = dict(set.intersection(*counts))
         self.left_alone = dict(set.intersection(*values))
         self.start = [dict(vars(layer)) for layer in self.layers]
@@ -272,11 +273,12 @@ class State:
         """Constants must not have changed in place."""
         if in_short and all(known == short(value) for value, known in self.in_short):
             return
-        kept, self.kept = self.kept, {}
-        now = {(i, name): self.by_value(self.fixed[i][name]) for i, name in self.constants}
-        self.kept = kept
-        for place, value in self.constants.items():
-            if now[place] != value:
+        now = [
+            {name: held[name] for j, name in self.constants if i == j}
+            for i, held in enumerate(self.fixed)
+        ]
+        for place, value in self.contents(now):
+            if value != self.constants[place]:
                 raise Refuted(place)
 
     def variables(self) -> Saved:
@@ -287,7 +289,7 @@ class State:
             for name in sorted(held):
                 value = held[name]
                 if name not in fixed:
-                    own[name] = value
+                    own[name] = value.now() if isinstance(value, Clock) else value
                 elif value is not fixed[name] and (i, name) in self.constants:
                     if self.by_value(value) != self.constants[i, name]:
                         raise Refuted((i, name))
@@ -342,6 +344,14 @@ class State:
         for place, start in self.clocks.items():
             clock = Clock(self.script, None, 1, start)
             self.watched[place] = clock.now() if self.is_plain else clock
+
+    def contents(self, variables: Saved) -> list[tuple[Place, Hashable]]:
+        """Attributes by value, also those that are saved by reference."""
+        kept, self.kept = self.kept, {}
+        held = [((i, k), v) for i, own in enumerate(variables) for k, v in own.items()]
+        found = [(place, self.by_value(value)) for place, value in held]
+        self.kept = kept
+        return found
 
     def by_value(self, value: Any) -> Hashable:
         """Something hashable that is equal for equal values."""

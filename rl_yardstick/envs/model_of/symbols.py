@@ -13,6 +13,7 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from statistics import NormalDist
+from time import perf_counter, process_time
 from types import SimpleNamespace
 from typing import Any, Self
 
@@ -33,6 +34,11 @@ class Stop(BaseException):
 
 class Limit(Stop):
     """The search came to one of its limits."""
+
+
+def seconds_since(begun: tuple[float, float]) -> float:
+    """Of processor time, but at least a fifth of those by the clock: an environment may wait."""
+    return max(process_time() - begun[0], (perf_counter() - begun[1]) / 5)
 
 
 def where() -> str:
@@ -83,7 +89,8 @@ class Symbol(NDArrayOperatorsMixin):
         return float(self.__round__(decimals))  # type: ignore[attr-defined]
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        return self.now().__reduce_ex__(protocol)
+        value = self.now()
+        return type(value), (value,)
 
 
 def _value_method(name: str) -> Callable[..., Any]:
