@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from rl_yardstick.commands import COMMANDS, NAME, SCRIPTS
 from rl_yardstick.pipeline.errors import OTHER_NAMES, UserError, did_you_mean, shown, unknown
-from rl_yardstick.pipeline.files import portable_name
+from rl_yardstick.pipeline.files import portable_name, write_json
 
 # --- names of the commands ------------------------------------------------------------------------
 
@@ -320,7 +320,26 @@ def check_alone(
             raise UserError(f"{name} cannot be given with {what}")
 
 
-# --- checks of values -----------------------------------------------------------------------------
+# --- what several flags mean ----------------------------------------------------------------------
+
+
+def typed_settings(args: argparse.Namespace, name: str) -> dict[str, Any]:
+    """The settings that the flags give to every agent; ``name`` is that of ``--hyperparams``."""
+    from rl_yardstick.pipeline.settings import BUDGETS, layered, parse_assignments
+
+    found: dict[str, Any] = parse_assignments(args.hyperparams, name)
+    for key in ("env_kwargs", "eval_env_kwargs"):
+        if given := getattr(args, key, None):
+            named = parse_assignments(given, f"--{key.replace('_', '-')}")
+            found = layered(found, {key: named})
+    budgets = {key: getattr(args, key, None) for key in BUDGETS}
+    return found | {key: n for key, n in budgets.items() if n is not None and n > 0}
+
+
+def write_result(args: argparse.Namespace, data: Any) -> None:
+    """Write the result to the file of ``--json``, if one is given."""
+    if args.json is not None:
+        write_json(args.json, data)
 
 
 def check_installed(wanted: object, what: str, extra: str, *modules: str) -> None:

@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import Flags, OneLineParser, flag, several, shared, switch
+from rl_yardstick.commands.terminal import table_console
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
 
 if TYPE_CHECKING:
@@ -115,7 +116,6 @@ def main() -> int:
     args.columns = dict(word.partition("=")[::2] for word in args.columns)
     if args.logged or args.policy:
         return compare_on_log(args)
-    from rl_yardstick.commands.terminal import table_console
     from rl_yardstick.experiments.study import METRICS
 
     if args.metric is not None and args.metric not in METRICS:
@@ -236,18 +236,18 @@ def finished(
     """
     from rl_yardstick.experiments.plan import plan
 
-    planned, known = plan(record.study, job.root, specs=record.specs), dict[Any, Any]()
+    planned, failures = plan(record.study, job.root, specs=record.specs), dict[Path, str]()
     check_settings_kept(job.root, planned)
     record.write(job.root)
     if not record.looks:
-        return do_study(job, record.study, planned, known), None
+        return do_study(job, record.study, planned, failures), None
     from rl_yardstick.experiments.analysis import looked
 
     counts, n_said = dict.fromkeys(record.specs, record.study.n_seeds), 0
     while True:
         study = replace(record.study, n_seeds=max(counts.values()))
         planned = plan(study, job.root, counts, record.specs)
-        results = do_study(job, study, planned, known)
+        results = do_study(job, study, planned, failures)
         said = looked(results, record.looks)
         if said.n_looks != n_said:
             n_said = said.n_looks
@@ -289,13 +289,12 @@ def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
 
 
 def do_study(
-    job: Job, study: StudySpec, planned: Sequence[PlannedRun], known: dict[Any, Any]
+    job: Job, study: StudySpec, planned: Sequence[PlannedRun], failures: dict[Path, str]
 ) -> StudyResults:
-    """Do the missing runs of a study, and read all; ``known`` were read or failed before."""
+    """Do the missing runs of a study, and read all; adds to ``failures``, which are not tried."""
     from rl_yardstick.agents.registry import ALGORITHMS
     from rl_yardstick.experiments.pool import do_runs
 
-    failures: dict[Path, str] = known.setdefault("failures", {})
     to_do = [run for run in planned if run.path not in failures and not run.is_finished]
     n_done = len(planned) - len(to_do)
     job.console.print(
@@ -317,8 +316,7 @@ def do_study(
     from rl_yardstick.experiments.results import read_results
 
     with job.console.status("reading the results"):
-        results = read_results(study, planned, job.root, known.setdefault("results", {}))
-    return replace(results, failures=failures)
+        return replace(read_results(study, planned, job.root), failures=failures)
 
 
 def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
@@ -336,9 +334,10 @@ def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
                 tell(f"{environment}: {note}")
         if note := mixed_versions(run.recorded() for run in results.finished):
             tell(note)
-    for one in results.left_out:
-        again = f"remove {one.planned.path} to do it again"
-        tell(f"left out: {one.planned.title}: {one.reason}; {again}")
+    for run in results.planned:
+        if reason := results.left_out.get(run.path):
+            again = f"remove {run.path} to do it again"
+            tell(f"left out: {run.title}: {reason}; {again}")
     return int(len(results.finished) < len(results.planned))
 
 
@@ -482,26 +481,14 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
     return files
 
 
-def typed_settings(args: argparse.Namespace) -> dict[str, Any]:
-    """The settings that the flags of a study or a search give to every agent."""
-    from rl_yardstick.experiments.study import layered
-    from rl_yardstick.pipeline.settings import parse_assignments
-
-    settings: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
-    if args.env_kwargs:
-        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
-        settings = layered(settings, named)
-    budgets = {"n_timesteps": args.n_timesteps, "n_episodes": args.n_episodes}
-    return settings | {key: value for key, value in budgets.items() if value is not None}
-
-
 def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     """The study with the settings of the command line in every agent."""
-    from rl_yardstick.experiments.study import AS_IT_COMES, layered
+    from rl_yardstick.experiments.study import AS_IT_COMES
     from rl_yardstick.pipeline.components import arguments_of
+    from rl_yardstick.pipeline.settings import layered
 
-    files = _conf_files(study, args.conf_file)
-    changes = {**(AS_IT_COMES if args.as_it_comes else {}), **typed_settings(args)}
+    files, typed = _conf_files(study, args.conf_file), cli.typed_settings(args, "--hyperparams")
+    changes = {**(AS_IT_COMES if args.as_it_comes else {}), **typed}
     is_free = args.is_quick and args.engine is None and "engine" not in changes
 
     def changed(agent: AgentSpec) -> AgentSpec:
@@ -520,8 +507,6 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
 
 def compare_on_log(args: argparse.Namespace) -> int:
     """Judge the policies of ``--policy`` on the log of ``--logged``; return the exit code."""
-    from rl_yardstick.commands.terminal import table_console
-
     if not (args.logged and args.policy):
         raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
     if args.study or args.env or args.algos:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import Flag, Flags, OneLineParser, flag, shared, switch, whole_number
+from rl_yardstick.commands.terminal import TextConsole, figures, result_lines, say
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -77,9 +78,6 @@ def build_parser() -> OneLineParser:
 def main() -> int:
     """Find a model and play it."""
     args = build_parser().parse_args()
-
-    from rl_yardstick.commands.terminal import TextConsole
-
     if args.n_envs > 1 and (args.record is not None or args.render in ("human", "ansi")):
         shown = "--record" if args.record is not None else f"--render {args.render}"
         raise UserError(f"{shown} shows one environment: leave out --n-envs")
@@ -119,7 +117,6 @@ def wanted_model(args: argparse.Namespace) -> Wanted:
 
 def found_model(console: Console, wanted: Wanted) -> Model:
     """Find the model and print its place."""
-    from rl_yardstick.commands.terminal import say
     from rl_yardstick.pipeline.models import find_model
 
     found = find_model(wanted)
@@ -146,7 +143,6 @@ def play(console: Console, found: Model, args: argparse.Namespace) -> None:
     with console.status("loading the agent"):
         import torch as th
 
-        from rl_yardstick.commands.terminal import say
         from rl_yardstick.pipeline.models import load_agent
         from rl_yardstick.pipeline.playing import play_episodes, playing_env
 
@@ -184,7 +180,6 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
         return ["no episode came to its end: raise --n-timesteps"]
     import numpy as np
 
-    from rl_yardstick.commands.terminal import figures, result_lines
     from rl_yardstick.pipeline.evaluation.sampled import bracketed_yardstick
     from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 
@@ -197,7 +192,6 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
 def expected_lines(spec: TrainSpec, agent: Any, deterministic: bool) -> list[str]:
     """The policy's exact evaluation, or why figures are sampled; empty if the model is unknown."""
     from rl_yardstick.agents.policies import why_not_exact
-    from rl_yardstick.commands.terminal import result_lines
     from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
     from rl_yardstick.pipeline.evaluation.judge import by_histories, world_of_memory
 

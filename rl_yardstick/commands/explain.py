@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, shared
 from rl_yardstick.commands.enjoy import MODEL_FLAGS, found_model, wanted_model
+from rl_yardstick.commands.terminal import TextConsole, say
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -46,7 +47,6 @@ def build_parser() -> OneLineParser:
 def main() -> int:
     """Explain an agent."""
     args = build_parser().parse_args()
-    from rl_yardstick.commands.terminal import TextConsole, say
     from rl_yardstick.report.words import as_words, why_lines
 
     console, wanted = TextConsole(), wanted_model(args)
@@ -64,10 +64,7 @@ def main() -> int:
         say(console, f"map: {args.map}")
     if args.test is not None:
         data["tried"] = tried_changes(console, args, one, explained)
-    if args.json is not None:
-        from rl_yardstick.pipeline.files import write_json
-
-        write_json(args.json, data)
+    cli.write_result(args, data)
     return 0
 
 
@@ -136,7 +133,6 @@ def tried_changes(
 ) -> list[Any]:
     """Train four seeds as shipped, as it is and with each change; return the returns as JSON."""
     from rl_yardstick.commands.compare import Job, finished, held
-    from rl_yardstick.commands.terminal import say
     from rl_yardstick.experiments.plan import StudyRecord, specs_of
     from rl_yardstick.experiments.pool import Workers
     from rl_yardstick.experiments.results import tried

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
+from rl_yardstick.commands.terminal import say, scale_lines, table_console
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -42,14 +43,11 @@ def main() -> int:
     from rl_yardstick.envs import found_models
 
     found_models.limit(args.exact_model, args.ignore, args.starts)
-    from rl_yardstick.commands.terminal import say, table_console
-    from rl_yardstick.pipeline.files import write_json
     from rl_yardstick.pipeline.settings import parse_assignments
 
     found = optimum_of(args.env, parse_assignments(args.env_kwargs, "--env-kwargs"))
     say(table_console(), "\n".join(found.lines))
-    if args.json is not None:
-        write_json(args.json, {"env": args.env, **found.figures})
+    cli.write_result(args, {"env": args.env, **found.figures})
     return 0
 
 
@@ -66,7 +64,6 @@ def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> Optimum:
     import numpy as np
 
     from rl_yardstick import mdp
-    from rl_yardstick.commands.terminal import scale_lines
     from rl_yardstick.envs import known_models as known
     from rl_yardstick.pipeline.environments import with_files_read
     from rl_yardstick.pipeline.evaluation.exact import known_model

@@ -104,7 +104,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     cli.check_installed(True, "tuning", "tune", "optuna")
     study = compare.study_of([args.algo], [args.env])
     # The settings that the command line fixes.
-    settings = cli.with_engine(args.algo, compare.typed_settings(args), args.engine)
+    settings = cli.with_engine(args.algo, cli.typed_settings(args, "--hyperparams"), args.engine)
     study = replace(
         study,
         name=args.name or study.name,

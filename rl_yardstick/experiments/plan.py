@@ -21,7 +21,6 @@ from rl_yardstick.experiments.study import (
     QuickSpec,
     StudySpec,
     file_name,
-    layered,
 )
 from rl_yardstick.pipeline import environments, settings
 from rl_yardstick.pipeline.errors import UserError, as_user_error
@@ -190,14 +189,16 @@ def _is_batch(spec: TrainSpec) -> bool:
 
 
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
+    place, changes = (agent.algo, environment.env_id), (environment.settings, agent.settings)
     settings.check_agent(agent.algo)
-    entry, origins = _entry(agent, environment)
+    if agent.tuned or agent.conf_file is not None:
+        entry, origins = settings.changed_entry(*place, agent.conf_file, *changes)
+    else:
+        entry, origins = settings.layered(*changes), {}
     spec = settings.read_spec(
-        agent.algo,
-        environment.env_id,
-        environments.with_files_read(environment.env_id, entry),
+        *place,
+        entry,
         origins=origins,
-        map_name=environments.map_name(environment.env_id, entry),
         pictures=False,
         eval_freq=study.eval_freq,
         eval_episodes=study.eval_episodes,
@@ -225,22 +226,6 @@ def _quickened(spec: TrainSpec, quick: QuickSpec) -> dict[str, int]:
             less = min(budget, most) if quick.budget is None else round(budget * quick.budget)
             found[key] = max(less, 1)
     return found
-
-
-def _entry(agent: AgentSpec, environment: EnvironmentSpec) -> tuple[dict[str, Any], dict[str, str]]:
-    """The entry of the agent's file, changed by the environment's settings, then by the agent's."""
-    entry: dict[str, Any] = {}
-    own = layered(environment.settings, agent.settings)
-    if agent.tuned or agent.conf_file is not None:
-        kwargs = own.get("env_kwargs")
-        try:
-            entry = settings.read_entry(agent.algo, environment.env_id, agent.conf_file, kwargs)
-        except UserError:
-            if agent.conf_file is not None or not (agent.settings or environment.settings):
-                raise
-    # The environment's settings remove keys with None before the agent's settings apply.
-    kept = {k: value for k, value in entry.items() if environment.settings.get(k, k) is not None}
-    return settings.training_follows(layered(kept, own), own)
 
 
 # --- the record of a study ------------------------------------------------------------------------
@@ -372,7 +357,7 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
     for agent, environment in product(study.agents, study.environments):
         label = agent.group or agent.label
         tuned_on = known(agent.algo, environment.env_id, agent.conf_file)
-        own = layered(environment.settings, agent.settings)
+        own = settings.layered(environment.settings, agent.settings)
         as_it_comes = {key for key in AS_IT_COMES if own.get(key) is None}
         if {*own} - _NO_TUNING - as_it_comes or tuned_on is None:
             unknown[label] = None
@@ -392,12 +377,12 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
 
 def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:
     """Whether the study has environment arguments that the entry does not have."""
-    own = layered(environment.settings, agent.settings)
+    own = settings.layered(environment.settings, agent.settings)
     places = agent.algo, environment.env_id, agent.conf_file
     entry = settings.read_entry(*places, own.get("env_kwargs"))
     if entry != settings.read_entry(*places):  # the entry of another id of the same environment
         del own["env_kwargs"]
-    merged, usual = layered(entry, own), environments.usual_kwargs(environment.env_id)
+    merged, usual = settings.layered(entry, own), environments.usual_kwargs(environment.env_id)
 
     def meant(given: Mapping[str, Any], key: str) -> Any:
         value = given.get(key) or {}

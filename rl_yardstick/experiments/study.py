@@ -21,8 +21,7 @@ from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknow
 from rl_yardstick.pipeline.files import plain, portable_name
 from rl_yardstick.pipeline.settings import (
     BUDGETS,
-    ENV_KWARGS,
-    override,
+    layered,
     parse_assignments,
     read_yaml,
     shipped_hyperparams,
@@ -68,16 +67,6 @@ def file_name(label: str) -> str:
     """The label as the name of a folder."""
     label = re.sub(r"(\w) = ", lambda found: f"{_SPELT.get(found[1], found[1])}=", label)
     return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_")
-
-
-def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings with ``changes`` applied; arguments of environments are merged one by one."""
-    merged = {
-        key: {**settings[key], **changes[key]}
-        for key in ENV_KWARGS
-        if isinstance(settings.get(key), dict) and isinstance(changes.get(key), dict)
-    }
-    return override(settings, {**changes, **merged})
 
 
 def _number(value: Any) -> Any:
