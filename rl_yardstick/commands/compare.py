@@ -52,7 +52,7 @@ FLAGS: Flags = {
         flag("study", "a study (a file, or a shipped one), or logs of finished runs", nargs="*"),
         several("--env", "environments", "ID"),
         several("--algos", "agents (train --list has them)", "AGENT"),
-        flag("--seeds", "how many seeds (default: the study's, or 10)", SEEDS),
+        flag("--seeds", "how many seeds (default: the study's, or 10)", SEEDS, dest="n_seeds"),
         flag(
             "--first-seed", "the first of these seeds (default: the study's, or 0)", cli.FIRST_SEED
         ),
@@ -161,21 +161,21 @@ def judge_logs(args: argparse.Namespace, command: str, console: Console, stop: S
     if len(args.env or ()) > 1:
         raise UserError("--env names the environment of logs that name none: give one")
     from rl_yardstick.experiments.logs import find_logs
-    from rl_yardstick.experiments.others import Options, results_of
+    from rl_yardstick.experiments.others import UNNAMED, results_of
     from rl_yardstick.experiments.study import file_name
     from rl_yardstick.pipeline.settings import parse_assignments
 
     kwargs = parse_assignments(args.env_kwargs, "--env-kwargs")
-    env, metric = (args.env or [Options.env])[0], args.metric or Options.metric
-    figures = tuple(args.figures or Options.figures)
-    options = Options(args.pattern, args.columns, env, kwargs, metric, args.margin, figures)
     paths = [Path(word) for word in args.study]
     root = Path(args.log_folder) / (args.name or file_name(paths[0].absolute().stem))
     if (root / "study.json").exists():
         raise UserError(f"{root} is a study's folder: give another one by --name NAME")
     with console.status("reading the logs"):
         logs, notes = find_logs(paths, args.columns)
-        results = results_of(logs, notes, options, root)
+        (env,) = args.env or [UNNAMED]
+        results = results_of(logs, notes, root, args.pattern, env, kwargs)
+    given = cli.given(args, ("metric", "margin", "figures"))
+    results = replace(results, study=replace(results.study, **given))
     for line in (results.study.title, *notes):
         console.print(line)
     workers = workers_of(args, root, None)
@@ -234,20 +234,18 @@ def finished(
     A growing study does one planned look after another, until no agent needs seeds or
     ``is_enough``; it begins with the first look, because finished runs may already be enough.
     """
+    from rl_yardstick.experiments.analysis import looked
     from rl_yardstick.experiments.plan import plan
 
-    planned, failures = plan(record.study, job.root, specs=record.specs), dict[Path, str]()
+    study, failures, n_said = record.study, dict[Path, str](), 0
+    counts = dict.fromkeys(record.specs, study.n_seeds)
+    planned = plan(study, job.root, counts, record.specs)
     check_settings_kept(job.root, planned)
     record.write(job.root)
-    if not record.looks:
-        return do_study(job, record.study, planned, failures), None
-    from rl_yardstick.experiments.analysis import looked
-
-    counts, n_said = dict.fromkeys(record.specs, record.study.n_seeds), 0
     while True:
-        study = replace(record.study, n_seeds=max(counts.values()))
-        planned = plan(study, job.root, counts, record.specs)
         results = do_study(job, study, planned, failures)
+        if not record.looks:
+            return results, None
         said = looked(results, record.looks)
         if said.n_looks != n_said:
             n_said = said.n_looks
@@ -258,6 +256,8 @@ def finished(
         if said.is_done or is_enough(said):
             return results, said
         counts |= {(agent, e): n for e, by in said.seeds.items() for agent, n in by.items()}
+        study = replace(study, n_seeds=max(counts.values()))
+        planned = plan(study, job.root, counts, record.specs)
 
 
 def carry_out(job: Job, record: StudyRecord) -> int:
@@ -430,10 +430,7 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
     is_file = bool(args.study)
     study = read_study(find_study(args.study[0])) if is_file else study_of(args.algos, args.env)
     # A flag with the name of a field sets that field, if it is given.
-    named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
-    changes = {**named, "n_seeds": args.seeds, "gym_packages": tuple(args.gym_packages)}
-    changes["figures"] = None if args.figures is None else tuple(args.figures)
-    changes = {key: value for key, value in changes.items() if value is not None}
+    changes = cli.given(args, (key.name for key in fields(StudySpec)))
     study = with_maps_named(replace(_with_settings(study, args), **changes))
     if not is_file:
         environments = ", ".join(each.label for each in study.environments)

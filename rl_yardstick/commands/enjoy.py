@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
+from secrets import randbelow
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
@@ -92,8 +93,6 @@ def main() -> int:
 
 def wanted_model(args: argparse.Namespace) -> Wanted:
     """The model that the arguments ask for; imports the modules that were typed."""
-    from secrets import randbelow
-
     from rl_yardstick.pipeline.models import Wanted
     from rl_yardstick.pipeline.settings import parse_assignments
 
@@ -132,9 +131,8 @@ def render_mode(args: argparse.Namespace) -> RenderMode | None:
         return "rgb_array"
     if args.render is not None:
         return None if args.render == "none" else args.render
-    has_display = sys.platform in ("darwin", "win32") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
+    variables = map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))
+    has_display = sys.platform in ("darwin", "win32") or any(variables)
     return "human" if has_display and args.n_envs == 1 else None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
@@ -45,22 +44,17 @@ def main() -> int:
     found_models.limit(args.exact_model, args.ignore, args.starts)
     from rl_yardstick.pipeline.settings import parse_assignments
 
-    found = optimum_of(args.env, parse_assignments(args.env_kwargs, "--env-kwargs"))
-    say(table_console(), "\n".join(found.lines))
-    cli.write_result(args, {"env": args.env, **found.figures})
+    found, lines = optimum_of(args.env, parse_assignments(args.env_kwargs, "--env-kwargs"))
+    say(table_console(), "\n".join(lines))
+    cli.write_result(args, {"env": args.env, **found})
     return 0
 
 
-@dataclass(frozen=True)
-class Optimum:
-    """The optimum of an environment: figures by name, and lines to print."""
+def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """The optimum of an environment: figures by name, and lines to print.
 
-    figures: dict[str, Any]
-    lines: list[str]
-
-
-def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> Optimum:
-    """The optimum of an environment; UserError where its model is not known."""
+    Raises UserError where its model is not known.
+    """
     import numpy as np
 
     from rl_yardstick import mdp
@@ -95,7 +89,7 @@ def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> Optimum:
     figures = {"optimum": best, "baseline": baseline, "horizon": horizon, "states": n_states}
     seconds = None if search is None else search.seconds
     found = {**figures, "seconds": seconds, "values": values, "actions": actions}
-    return Optimum(found, [*filter(None, lines)])
+    return found, [*filter(None, lines)]
 
 
 def _first_actions(world: World, starts: Ints, actions: Bools) -> Iterator[str]:

@@ -7,7 +7,9 @@ from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
+from secrets import randbelow
 from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
 from rl_yardstick.commands import cli, terminal
 from rl_yardstick.commands.cli import Flags, OneLineParser, flag, several, shared, switch
@@ -115,8 +117,6 @@ def main() -> int:
     spec = spec_from_flags(args)
     if args.resume_or_start and (found := newest_run(args, partial(has_spec, spec, args.seed < 0))):
         return resume(Run(found, console, stop), args)
-    from uuid import uuid4
-
     suffix = f"_{uuid4()}" if args.uuid else ""
     run = Run.claim(Path(args.log_folder), spec, suffix, console=console, stop=stop)
     return carry_out(spec, run, args, resumes=False)
@@ -155,8 +155,6 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
 
 def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
     """The spec that the flags and the hyperparameters ask for; torch is not imported."""
-    from secrets import randbelow
-
     from rl_yardstick.pipeline import environments, settings
 
     settings.check_agent(args.algo)

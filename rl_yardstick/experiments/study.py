@@ -90,9 +90,7 @@ class AgentSpec:
     label: str  #: its name in tables and figures
     algo: str  #: its name in the table of agents
     settings: dict[str, Any] = field(default_factory=dict)  #: which override those of its file
-    tuned: bool = (
-        True  #: whether to start from the shipped file, or from the constructor's defaults
-    )
+    tuned: bool = True  #: whether to start from the shipped file, or else from the defaults
     conf_file: Path | None = None  #: another file of hyperparameters to start from
     summary: str = ""  #: a short description for the report
     where: str = field(default="", compare=False)  #: the file with its settings, for messages
@@ -213,9 +211,9 @@ def _as_texts(values: Sequence[Any]) -> list[str]:
 # --- study files ----------------------------------------------------------------------------------
 
 
-def _seconds(value: Any) -> Any:
+def seconds(value: Any) -> float:
     """A time such as 90, 90s, 10m, 2h or 1d."""
-    found = re.fullmatch(r"(\d*\.?\d+)\s*(|s|m|min|h|d)", str(value).strip())
+    found = re.fullmatch(r"(\d*\.?\d+(?:e\d+)?)\s*(|s|m|min|h|d)", str(value).strip())
     if found is None or not float(found[1]) > 0:
         raise ValueError(f"must be a time such as 90s, 10m or 2h, not {shown(value)}")
     units = {"m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -294,7 +292,7 @@ class _File(_Part):
     threshold: _Float | None = None
     episodes_table: _FromZero = 0
     diagnose: bool = False
-    run_timeout: Annotated[float, BeforeValidator(_seconds)] | None = None
+    run_timeout: Annotated[float, BeforeValidator(seconds)] | None = None
 
 
 _LISTS = ("agents", "environments")
