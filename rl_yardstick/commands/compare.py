@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import Flags, OneLineParser, flag, several, shared, switch
 from rl_yardstick.commands.terminal import table_console
-from rl_yardstick.pipeline.errors import UserError, shown, unknown
+from rl_yardstick.pipeline.errors import UserError, unknown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -235,7 +235,7 @@ def finished(
     ``is_enough``; it begins with the first look, because finished runs may already be enough.
     """
     from rl_yardstick.experiments.analysis import looked
-    from rl_yardstick.experiments.plan import plan
+    from rl_yardstick.experiments.plan import check_settings_kept, plan
 
     study, failures, n_said = record.study, dict[Path, str](), 0
     counts = dict.fromkeys(record.specs, study.n_seeds)
@@ -272,20 +272,6 @@ def carry_out(job: Job, record: StudyRecord) -> int:
     design = f"{looks[-1]:,} seeds of each agent would be {looks[-1] * len(record.specs):,}"
     job.console.print(f"{n_runs:,} runs, where {design}; {left}")
     return code
-
-
-def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
-    """Refuse a study in whose folder runs have finished with other settings."""
-    from rl_yardstick.experiments.plan import other_settings
-
-    others = other_settings(planned)
-    if others:
-        pairs = {key: pair for _, settings in others for key, pair in settings.items()}
-        named = [f"{key}: {shown(a)} there, {shown(b)} now" for key, (a, b) in pairs.items()]
-        words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
-        runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
-        fault = f"{root}: {runs} other settings ({words})"
-        raise UserError(f"{fault}: give the study another folder by --name NAME")
 
 
 def do_study(

@@ -23,7 +23,7 @@ from rl_yardstick.experiments.study import (
     file_name,
 )
 from rl_yardstick.pipeline import environments, settings
-from rl_yardstick.pipeline.errors import UserError, as_user_error
+from rl_yardstick.pipeline.errors import UserError, as_user_error, shown
 from rl_yardstick.pipeline.files import plain, read_json, write_json
 from rl_yardstick.pipeline.run import FINISHED, Run
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -316,11 +316,18 @@ def look_sizes(first: int, most: int) -> tuple[int, ...]:
     return tuple(sizes)
 
 
-def other_settings(planned: Sequence[PlannedRun]) -> list[tuple[PlannedRun, dict[str, Any]]]:
-    """The finished runs in the folders that have other settings than planned, and these."""
+def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
+    """Refuse a study in whose folder runs have finished with other settings."""
     recorded = [(run, run.recorded()) for run in planned]
     finished = [(run, found) for run, found in recorded if found.get("state") == FINISHED]
-    return [(run, there) for run, found in finished if (there := run.differences(found))]
+    others = [there for run, found in finished if (there := run.differences(found))]
+    if others:
+        pairs = {key: pair for settings in others for key, pair in settings.items()}
+        named = [f"{key}: {shown(a)} there, {shown(b)} now" for key, (a, b) in pairs.items()]
+        words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
+        runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
+        fault = f"{root}: {runs} other settings ({words})"
+        raise UserError(f"{fault}: give the study another folder by --name NAME")
 
 
 # --- the seeds of a study on which its settings were tuned, as far as known -----------------------

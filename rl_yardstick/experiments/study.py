@@ -295,7 +295,6 @@ class _File(_Part):
     run_timeout: Annotated[float, BeforeValidator(seconds)] | None = None
 
 
-_LISTS = ("agents", "environments")
 # Keys that mean the same as fields of `StudySpec`.
 _SAME = (
     *("description", "eval_freq", "eval_episodes", "metric", "margin", "shared_randomness"),
@@ -326,15 +325,14 @@ def read_study(path: Path) -> StudySpec:
     data = read_yaml(path)
     if not (isinstance(data, dict) and all(isinstance(key, str) for key in data)):
         raise UserError(f"{path}: a study must map names to values")
-    # What is not given is read too: lists of names that are missing.
-    data = dict.fromkeys(_LISTS) | {k: v for k, v in data.items() if v is not None}
-    try:
-        file = _File.model_validate(data)
+    given = {key: value for key, value in data.items() if value is not None}
+    try:  # lists of names that are missing are read too
+        file = _File.model_validate({"agents": None, "environments": None, **given})
     except ValidationError as error:
         raise _in_one_line(path, error) from None
-    given = {key: value for key in BUDGETS if (value := getattr(file, key)) is not None}
+    budgets = file.model_dump(include={*BUDGETS}, exclude_none=True)
     agents = tuple(_agents(path, file))
-    shared, environments = layered(file.settings, given), []
+    shared, environments = layered(file.settings, budgets), []
     for label, entry in file.environments.items():
         env_id = label if entry.id is None else entry.id
         with as_user_error(str(path), UserError):
