@@ -45,10 +45,13 @@ def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> 
         Stopped: after a SIGTERM; the state of the training is saved.
     """
     spec, path = planned.spec, planned.path
+    before = signal.getsignal(signal.SIGTERM)
+    # Ctrl-C reaches all processes, and is the driver's to heed.
+    asked = Stop().listen(signal.SIGTERM) if stop is None else stop
     try:
         import_modules(spec.gym_packages)
         path.mkdir(parents=True, exist_ok=True)
-        with _sigterm_noticed(stop) as asked, Run(path, stop=asked) as run:
+        with Run(path, stop=asked) as run:
             if planned.is_finished:
                 return
             resumes = _can_resume(planned, run)
@@ -69,6 +72,9 @@ def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> 
         with suppress(OSError):
             (path / ERROR_FILE).write_text(traceback.format_exc(), encoding="utf-8")
         raise UserError(f"{one_line(error)}; see {path / ERROR_FILE}") from None
+    finally:
+        if stop is None:
+            signal.signal(signal.SIGTERM, before)
 
 
 def _can_resume(planned: PlannedRun, run: Run) -> bool:
@@ -88,19 +94,6 @@ def _clear(planned: PlannedRun) -> None:
             path.unlink()
     if planned.spec.tensorboard_log is not None:
         shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)
-
-
-@contextmanager
-def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
-    """The request to stop; Ctrl-C reaches all processes, and is the driver's to heed."""
-    if stop is not None:
-        yield stop
-        return
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        yield Stop().listen(signal.SIGTERM)
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 # --- workers on this machine ----------------------------------------------------------------------
