@@ -44,9 +44,8 @@ The same command again continues the search.
 """
 
 SEEDS, TRIALS, STARTUP = (cli.whole_number(*ends) for ends in ((1, 1000), (1, 10**5), (0, 10**5)))
-# Flags that set the field of `StudySpec` with their name.
+# Flags that set the field of `StudySpec` with their name, as --gym-packages does.
 OF_STUDY = ("name", "first_seed", "eval_freq", "eval_episodes", "threshold", "run_timeout")
-OF_STUDY += ("gym_packages",)
 METRIC = "figure of a run (default: score, return or regret)"
 FOLDER = "-f --log-folder --optimization-log-path"  # as in rl_zoo3
 FLAGS: Flags = {
@@ -108,8 +107,9 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     # The settings that the command line fixes.
     settings = cli.with_engine(args.algo, cli.typed_settings(args, "--hyperparams"), args.engine)
     agent = AgentSpec(SHIPPED, args.algo, settings, conf_file=args.conf_file)
-    given = {"agents": (agent,), "n_seeds": args.seeds_per_trial, **cli.given(args, OF_STUDY)}
-    study = with_maps_named(replace(study, **given))
+    given = cli.given(args, (*OF_STUDY, "gym_packages"))
+    study = replace(study, agents=(agent,), n_seeds=args.seeds_per_trial, **given)
+    study = with_maps_named(study)
     title = f"{args.algo} on {study.environments[0].label}: a search for settings"
     # A flag with the name of a field sets that field.
     named = cli.given(args, (key.name for key in fields(TuningSpec)))
