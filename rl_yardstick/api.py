@@ -217,9 +217,9 @@ def explain(model: Any, env: Any = None, **env_kwargs: Any) -> Told:
             algo = _agent(type(model))
             model.save(path)
         wanted = Wanted(path, algo, env_id, env_kwargs=kwargs | env_kwargs, typed=typed)
-        one = explain_command.asked(TextConsole(quiet=True), wanted)
-    found = explanation(one.found.spec, one.agent, one.evaluator)
-    return Told(found.as_data(), why_lines(found))
+        found, agent, evaluator = explain_command.asked(TextConsole(quiet=True), wanted)
+    explained = explanation(found.spec, agent, evaluator)
+    return Told(explained.as_data(), why_lines(explained))
 
 
 def audit(algo: str | type, **settings: Any) -> Told:
@@ -243,8 +243,7 @@ def optimum(env: Any, **env_kwargs: Any) -> Told:
     """
     env_id, kwargs = _environment(env)
     check_env_id(env_id)
-    found = optimum_command.optimum_of(env_id, kwargs | env_kwargs)
-    return Told(found.figures, found.lines)
+    return Told(*optimum_command.optimum_of(env_id, kwargs | env_kwargs))
 
 
 def model(env: Any, **env_kwargs: Any) -> TransitionModel:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, shared, whole_number
+from rl_yardstick.commands.terminal import TextConsole, say
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -50,9 +51,6 @@ def build_parser() -> OneLineParser:
 def main() -> int:
     """Audit an algorithm; return the exit code."""
     args = build_parser().parse_args()
-    from rl_yardstick.commands.terminal import TextConsole, say
-    from rl_yardstick.pipeline.files import write_json
-
     console = TextConsole()
     with console.status("loading the libraries"):
         import torch as th
@@ -64,8 +62,7 @@ def main() -> int:
         verdict = audit(subject, args.seeds or 0)
     for line in verdict.lines():
         say(console, line)
-    if args.json is not None:
-        write_json(args.json, verdict.as_json())
+    cli.write_result(args, verdict.as_json())
     return verdict.exit_code
 
 

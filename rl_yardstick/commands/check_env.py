@@ -8,6 +8,7 @@ import time
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, shared
+from rl_yardstick.commands.terminal import table_console
 
 EPILOG = """\
 examples:
@@ -31,10 +32,8 @@ def main() -> int:
     args, begin = build_parser().parse_args(), time.monotonic()
     cli.import_typed(args)
     cli.register_typed(args)
-    from rl_yardstick.commands.terminal import table_console
     from rl_yardstick.diagnosis.environment_checks import LATE, examine
     from rl_yardstick.pipeline.environments import make_env
-    from rl_yardstick.pipeline.files import write_json
     from rl_yardstick.pipeline.settings import parse_assignments
 
     kwargs = {**parse_assignments(args.env_kwargs, "--env-kwargs"), "disable_env_checker": True}
@@ -50,7 +49,6 @@ def main() -> int:
     for one in found:
         console.print(str(one), style="red" if one.level == "breaks" else None)
     console.print(f"{args.env}: {len(found) or 'nothing'} found in {seconds:.1f} s")
-    if args.json is not None:
-        data = [vars(one) for one in found]
-        write_json(args.json, {"env": args.env, "seconds": seconds, "findings": data})
+    data = {"env": args.env, "seconds": seconds, "findings": [vars(one) for one in found]}
+    cli.write_result(args, data)
     return int(any(one.level == "breaks" for one in found))

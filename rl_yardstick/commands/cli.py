@@ -11,7 +11,7 @@ import os
 import shlex
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from rl_yardstick.commands import COMMANDS, NAME, SCRIPTS
 from rl_yardstick.pipeline.errors import OTHER_NAMES, UserError, did_you_mean, shown, unknown
-from rl_yardstick.pipeline.files import portable_name
+from rl_yardstick.pipeline.files import portable_name, write_json
 
 # --- names of the commands ------------------------------------------------------------------------
 
@@ -185,14 +185,12 @@ def whole_number(
 
 def seconds(text: str) -> float:
     """A time such as ``90``, ``90s``, ``10m`` or ``2h``."""
-    unit = {"s": 1.0, "m": 60.0, "h": 3600.0}.get(text[-1:])
+    from rl_yardstick.experiments.study import seconds as read
+
     try:
-        number = float(text if unit is None else text[:-1]) * (unit or 1.0)
-    except ValueError:
-        number = -1.0
-    if not 0 < number < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be a time such as 90s, 10m or 2h, not {text!r}")
-    return number
+        return read(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def folder_name(text: str) -> str:
@@ -320,7 +318,31 @@ def check_alone(
             raise UserError(f"{name} cannot be given with {what}")
 
 
-# --- checks of values -----------------------------------------------------------------------------
+# --- what several flags mean ----------------------------------------------------------------------
+
+
+def given(args: argparse.Namespace, names: Iterable[str]) -> dict[str, Any]:
+    """The values of those of the flags that are given, by name; lists as tuples."""
+    values = {name: getattr(args, name, None) for name in names}
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if v is not None}
+
+
+def typed_settings(args: argparse.Namespace, name: str) -> dict[str, Any]:
+    """The settings that the flags give to every agent; ``name`` is that of ``--hyperparams``."""
+    from rl_yardstick.pipeline.settings import BUDGETS, layered, parse_assignments
+
+    found: dict[str, Any] = parse_assignments(args.hyperparams, name)
+    for key in ("env_kwargs", "eval_env_kwargs"):
+        if words := getattr(args, key, None):
+            named = parse_assignments(words, f"--{key.replace('_', '-')}")
+            found = layered(found, {key: named})
+    return found | {key: n for key, n in given(args, BUDGETS).items() if n > 0}
+
+
+def write_result(args: argparse.Namespace, data: Any) -> None:
+    """Write the result to the file of ``--json``, if one is given."""
+    if args.json is not None:
+        write_json(args.json, data)
 
 
 def check_installed(wanted: object, what: str, extra: str, *modules: str) -> None:

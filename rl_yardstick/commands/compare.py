@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import Flags, OneLineParser, flag, several, shared, switch
-from rl_yardstick.pipeline.errors import UserError, shown, unknown
+from rl_yardstick.commands.terminal import table_console
+from rl_yardstick.pipeline.errors import UserError, unknown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -51,7 +52,7 @@ FLAGS: Flags = {
         flag("study", "a study (a file, or a shipped one), or logs of finished runs", nargs="*"),
         several("--env", "environments", "ID"),
         several("--algos", "agents (train --list has them)", "AGENT"),
-        flag("--seeds", "how many seeds (default: the study's, or 10)", SEEDS),
+        flag("--seeds", "how many seeds (default: the study's, or 10)", SEEDS, dest="n_seeds"),
         flag(
             "--first-seed", "the first of these seeds (default: the study's, or 0)", cli.FIRST_SEED
         ),
@@ -115,7 +116,6 @@ def main() -> int:
     args.columns = dict(word.partition("=")[::2] for word in args.columns)
     if args.logged or args.policy:
         return compare_on_log(args)
-    from rl_yardstick.commands.terminal import table_console
     from rl_yardstick.experiments.study import METRICS
 
     if args.metric is not None and args.metric not in METRICS:
@@ -161,21 +161,21 @@ def judge_logs(args: argparse.Namespace, command: str, console: Console, stop: S
     if len(args.env or ()) > 1:
         raise UserError("--env names the environment of logs that name none: give one")
     from rl_yardstick.experiments.logs import find_logs
-    from rl_yardstick.experiments.others import Options, results_of
+    from rl_yardstick.experiments.others import UNNAMED, results_of
     from rl_yardstick.experiments.study import file_name
     from rl_yardstick.pipeline.settings import parse_assignments
 
     kwargs = parse_assignments(args.env_kwargs, "--env-kwargs")
-    env, metric = (args.env or [Options.env])[0], args.metric or Options.metric
-    figures = tuple(args.figures or Options.figures)
-    options = Options(args.pattern, args.columns, env, kwargs, metric, args.margin, figures)
     paths = [Path(word) for word in args.study]
     root = Path(args.log_folder) / (args.name or file_name(paths[0].absolute().stem))
     if (root / "study.json").exists():
         raise UserError(f"{root} is a study's folder: give another one by --name NAME")
     with console.status("reading the logs"):
         logs, notes = find_logs(paths, args.columns)
-        results = results_of(logs, notes, options, root)
+        (env,) = args.env or [UNNAMED]
+        results = results_of(logs, notes, root, args.pattern, env, kwargs)
+    given = cli.given(args, ("metric", "margin", "figures"))
+    results = replace(results, study=replace(results.study, **given))
     for line in (results.study.title, *notes):
         console.print(line)
     workers = workers_of(args, root, None)
@@ -234,20 +234,18 @@ def finished(
     A growing study does one planned look after another, until no agent needs seeds or
     ``is_enough``; it begins with the first look, because finished runs may already be enough.
     """
-    from rl_yardstick.experiments.plan import plan
+    from rl_yardstick.experiments.analysis import looked
+    from rl_yardstick.experiments.plan import check_settings_kept, plan
 
-    planned, known = plan(record.study, job.root, specs=record.specs), dict[Any, Any]()
+    study, failures, n_said = record.study, dict[Path, str](), 0
+    counts = dict.fromkeys(record.specs, study.n_seeds)
+    planned = plan(study, job.root, counts, record.specs)
     check_settings_kept(job.root, planned)
     record.write(job.root)
-    if not record.looks:
-        return do_study(job, record.study, planned, known), None
-    from rl_yardstick.experiments.analysis import looked
-
-    counts, n_said = dict.fromkeys(record.specs, record.study.n_seeds), 0
     while True:
-        study = replace(record.study, n_seeds=max(counts.values()))
-        planned = plan(study, job.root, counts, record.specs)
-        results = do_study(job, study, planned, known)
+        results = do_study(job, study, planned, failures)
+        if not record.looks:
+            return results, None
         said = looked(results, record.looks)
         if said.n_looks != n_said:
             n_said = said.n_looks
@@ -258,6 +256,8 @@ def finished(
         if said.is_done or is_enough(said):
             return results, said
         counts |= {(agent, e): n for e, by in said.seeds.items() for agent, n in by.items()}
+        study = replace(study, n_seeds=max(counts.values()))
+        planned = plan(study, job.root, counts, record.specs)
 
 
 def carry_out(job: Job, record: StudyRecord) -> int:
@@ -274,28 +274,13 @@ def carry_out(job: Job, record: StudyRecord) -> int:
     return code
 
 
-def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
-    """Refuse a study in whose folder runs have finished with other settings."""
-    from rl_yardstick.experiments.plan import other_settings
-
-    others = other_settings(planned)
-    if others:
-        pairs = {key: pair for _, settings in others for key, pair in settings.items()}
-        named = [f"{key}: {shown(a)} there, {shown(b)} now" for key, (a, b) in pairs.items()]
-        words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
-        runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
-        fault = f"{root}: {runs} other settings ({words})"
-        raise UserError(f"{fault}: give the study another folder by --name NAME")
-
-
 def do_study(
-    job: Job, study: StudySpec, planned: Sequence[PlannedRun], known: dict[Any, Any]
+    job: Job, study: StudySpec, planned: Sequence[PlannedRun], failures: dict[Path, str]
 ) -> StudyResults:
-    """Do the missing runs of a study, and read all; ``known`` were read or failed before."""
+    """Do the missing runs of a study, and read all; adds to ``failures``, which are not tried."""
     from rl_yardstick.agents.registry import ALGORITHMS
     from rl_yardstick.experiments.pool import do_runs
 
-    failures: dict[Path, str] = known.setdefault("failures", {})
     to_do = [run for run in planned if run.path not in failures and not run.is_finished]
     n_done = len(planned) - len(to_do)
     job.console.print(
@@ -317,8 +302,7 @@ def do_study(
     from rl_yardstick.experiments.results import read_results
 
     with job.console.status("reading the results"):
-        results = read_results(study, planned, job.root, known.setdefault("results", {}))
-    return replace(results, failures=failures)
+        return replace(read_results(study, planned, job.root), failures=failures)
 
 
 def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
@@ -336,9 +320,10 @@ def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
                 tell(f"{environment}: {note}")
         if note := mixed_versions(run.recorded() for run in results.finished):
             tell(note)
-    for one in results.left_out:
-        again = f"remove {one.planned.path} to do it again"
-        tell(f"left out: {one.planned.title}: {one.reason}; {again}")
+    for run in results.planned:
+        if reason := results.left_out.get(run.path):
+            again = f"remove {run.path} to do it again"
+            tell(f"left out: {run.title}: {reason}; {again}")
     return int(len(results.finished) < len(results.planned))
 
 
@@ -431,10 +416,7 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
     is_file = bool(args.study)
     study = read_study(find_study(args.study[0])) if is_file else study_of(args.algos, args.env)
     # A flag with the name of a field sets that field, if it is given.
-    named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
-    changes = {**named, "n_seeds": args.seeds, "gym_packages": tuple(args.gym_packages)}
-    changes["figures"] = None if args.figures is None else tuple(args.figures)
-    changes = {key: value for key, value in changes.items() if value is not None}
+    changes = cli.given(args, (key.name for key in fields(StudySpec)))
     study = with_maps_named(replace(_with_settings(study, args), **changes))
     if not is_file:
         environments = ", ".join(each.label for each in study.environments)
@@ -482,26 +464,14 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
     return files
 
 
-def typed_settings(args: argparse.Namespace) -> dict[str, Any]:
-    """The settings that the flags of a study or a search give to every agent."""
-    from rl_yardstick.experiments.study import layered
-    from rl_yardstick.pipeline.settings import parse_assignments
-
-    settings: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
-    if args.env_kwargs:
-        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
-        settings = layered(settings, named)
-    budgets = {"n_timesteps": args.n_timesteps, "n_episodes": args.n_episodes}
-    return settings | {key: value for key, value in budgets.items() if value is not None}
-
-
 def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     """The study with the settings of the command line in every agent."""
-    from rl_yardstick.experiments.study import AS_IT_COMES, layered
+    from rl_yardstick.experiments.study import AS_IT_COMES
     from rl_yardstick.pipeline.components import arguments_of
+    from rl_yardstick.pipeline.settings import layered
 
-    files = _conf_files(study, args.conf_file)
-    changes = {**(AS_IT_COMES if args.as_it_comes else {}), **typed_settings(args)}
+    files, typed = _conf_files(study, args.conf_file), cli.typed_settings(args, "--hyperparams")
+    changes = {**(AS_IT_COMES if args.as_it_comes else {}), **typed}
     is_free = args.is_quick and args.engine is None and "engine" not in changes
 
     def changed(agent: AgentSpec) -> AgentSpec:
@@ -520,8 +490,6 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
 
 def compare_on_log(args: argparse.Namespace) -> int:
     """Judge the policies of ``--policy`` on the log of ``--logged``; return the exit code."""
-    from rl_yardstick.commands.terminal import table_console
-
     if not (args.logged and args.policy):
         raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
     if args.study or args.env or args.algos:

@@ -9,10 +9,12 @@ import time
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
+from secrets import randbelow
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import Flag, Flags, OneLineParser, flag, shared, switch, whole_number
+from rl_yardstick.commands.terminal import TextConsole, figures, result_lines, say
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -77,9 +79,6 @@ def build_parser() -> OneLineParser:
 def main() -> int:
     """Find a model and play it."""
     args = build_parser().parse_args()
-
-    from rl_yardstick.commands.terminal import TextConsole
-
     if args.n_envs > 1 and (args.record is not None or args.render in ("human", "ansi")):
         shown = "--record" if args.record is not None else f"--render {args.render}"
         raise UserError(f"{shown} shows one environment: leave out --n-envs")
@@ -94,8 +93,6 @@ def main() -> int:
 
 def wanted_model(args: argparse.Namespace) -> Wanted:
     """The model that the arguments ask for; imports the modules that were typed."""
-    from secrets import randbelow
-
     from rl_yardstick.pipeline.models import Wanted
     from rl_yardstick.pipeline.settings import parse_assignments
 
@@ -119,7 +116,6 @@ def wanted_model(args: argparse.Namespace) -> Wanted:
 
 def found_model(console: Console, wanted: Wanted) -> Model:
     """Find the model and print its place."""
-    from rl_yardstick.commands.terminal import say
     from rl_yardstick.pipeline.models import find_model
 
     found = find_model(wanted)
@@ -135,9 +131,8 @@ def render_mode(args: argparse.Namespace) -> RenderMode | None:
         return "rgb_array"
     if args.render is not None:
         return None if args.render == "none" else args.render
-    has_display = sys.platform in ("darwin", "win32") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
+    variables = map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))
+    has_display = sys.platform in ("darwin", "win32") or any(variables)
     return "human" if has_display and args.n_envs == 1 else None
 
 
@@ -146,7 +141,6 @@ def play(console: Console, found: Model, args: argparse.Namespace) -> None:
     with console.status("loading the agent"):
         import torch as th
 
-        from rl_yardstick.commands.terminal import say
         from rl_yardstick.pipeline.models import load_agent
         from rl_yardstick.pipeline.playing import play_episodes, playing_env
 
@@ -184,7 +178,6 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
         return ["no episode came to its end: raise --n-timesteps"]
     import numpy as np
 
-    from rl_yardstick.commands.terminal import figures, result_lines
     from rl_yardstick.pipeline.evaluation.sampled import bracketed_yardstick
     from rl_yardstick.pipeline.evaluation.yardstick import Evaluation
 
@@ -197,7 +190,6 @@ def played_lines(spec: TrainSpec, show: Show, is_normalised: bool) -> list[str]:
 def expected_lines(spec: TrainSpec, agent: Any, deterministic: bool) -> list[str]:
     """The policy's exact evaluation, or why figures are sampled; empty if the model is unknown."""
     from rl_yardstick.agents.policies import why_not_exact
-    from rl_yardstick.commands.terminal import result_lines
     from rl_yardstick.pipeline.evaluation.exact import exact_evaluator, model_refusal
     from rl_yardstick.pipeline.evaluation.judge import by_histories, world_of_memory
 

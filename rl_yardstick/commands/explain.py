@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, shared
 from rl_yardstick.commands.enjoy import MODEL_FLAGS, found_model, wanted_model
+from rl_yardstick.commands.terminal import TextConsole, say
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -46,41 +47,28 @@ def build_parser() -> OneLineParser:
 def main() -> int:
     """Explain an agent."""
     args = build_parser().parse_args()
-    from rl_yardstick.commands.terminal import TextConsole, say
     from rl_yardstick.report.words import as_words, why_lines
 
-    console, wanted = TextConsole(), wanted_model(args)
-    one = asked(console, wanted)
+    console = TextConsole()
+    found, agent, evaluator = asked(console, wanted_model(args))
     from rl_yardstick.diagnosis.explanation import explanation
 
-    explained = explanation(one.found.spec, one.agent, one.evaluator)
+    explained = explanation(found.spec, agent, evaluator)
     say(console, "\n".join(why_lines(explained)))
     if explained.proposals and args.test is None:
         likeliest = ", ".join(f"--test {as_words(one)}" for one in explained.proposals[:2])
         say(console, f"to see what helps: {likeliest}, or --test alone")
     data = explained.as_data()
     if args.map is not None:
-        draw(one, explained, args.map)
+        draw(args.map, f"{found.spec.algo} on {found.spec.place}", agent, evaluator, explained)
         say(console, f"map: {args.map}")
     if args.test is not None:
-        data["tried"] = tried_changes(console, args, one, explained)
-    if args.json is not None:
-        from rl_yardstick.pipeline.files import write_json
-
-        write_json(args.json, data)
+        data["tried"] = tried_changes(console, args, found, explained)
+    cli.write_result(args, data)
     return 0
 
 
-@dataclass(frozen=True)
-class Asked:
-    """An agent to explain, with the exact evaluator of its environment."""
-
-    found: Model
-    evaluator: ExactEvaluator
-    agent: BaseAlgorithm
-
-
-def asked(console: Console, wanted: Wanted) -> Asked:
+def asked(console: Console, wanted: Wanted) -> tuple[Model, BaseAlgorithm, ExactEvaluator]:
     """Find and load an agent, and compute the optimum of its environment."""
     found = found_model(console, median_run(wanted))
     with console.status("computing the optimum"):
@@ -94,7 +82,7 @@ def asked(console: Console, wanted: Wanted) -> Asked:
             reason = model_refusal(spec, False) or f"the model of {spec.env_id} is not known"
             raise UserError(f"{reason}, so the gap to the optimum cannot be split")
         with closing(playing_env(found, None)) as env:
-            return Asked(found, evaluator, load_agent(found, env))
+            return found, load_agent(found, env), evaluator
 
 
 def median_run(wanted: Wanted) -> Wanted:
@@ -117,26 +105,24 @@ def median_run(wanted: Wanted) -> Wanted:
     return replace(wanted, path=run, algo=None, env_id=None)
 
 
-def draw(one: Asked, explained: Explanation, path: Path) -> None:
+def draw(path: Path, title: str, agent: Any, evaluator: Any, explained: Explanation) -> None:
     """Draw the cost of each cell."""
     from rl_yardstick.pipeline.evaluation.value_maps import MAX_STATES, value_map
     from rl_yardstick.pipeline.pictures import draw_cost_map
 
     if path.suffix != ".png":
         raise UserError(f"--map writes a .png, not {path}")
-    found = value_map(one.evaluator, one.agent)
+    found = value_map(evaluator, agent)
     if found is None:
         raise UserError(f"--map: only grid worlds of up to {MAX_STATES:,} states have a map")
-    spec = one.found.spec
-    draw_cost_map(path, f"{spec.algo} on {spec.place}", found, explained.losses)
+    draw_cost_map(path, title, found, explained.losses)
 
 
 def tried_changes(
-    console: Any, args: argparse.Namespace, one: Asked, explained: Explanation
+    console: Any, args: argparse.Namespace, model: Model, explained: Explanation
 ) -> list[Any]:
     """Train four seeds as shipped, as it is and with each change; return the returns as JSON."""
     from rl_yardstick.commands.compare import Job, finished, held
-    from rl_yardstick.commands.terminal import say
     from rl_yardstick.experiments.plan import StudyRecord, specs_of
     from rl_yardstick.experiments.pool import Workers
     from rl_yardstick.experiments.results import tried
@@ -144,9 +130,9 @@ def tried_changes(
     from rl_yardstick.pipeline.run import Stop
     from rl_yardstick.report.words import tried_lines
 
-    spec, run = one.found.spec, one.found.run
+    spec, run = model.spec, model.run
     changes = [" ".join(change) for change in args.test if change] or explained.proposals
-    name = one.found.path.stem if run is None else f"{spec.algo}_{run.name}"
+    name = model.path.stem if run is None else f"{spec.algo}_{run.name}"
     study = intervention_study(spec, changes, name)
     root, record = Path(args.folder) / "explain" / study.name, StudyRecord(study, specs_of(study))
     job = Job(root, cli.command_line(), console, Stop().listen(), Workers(args.jobs))

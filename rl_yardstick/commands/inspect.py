@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rl_yardstick.commands.cli import OneLineParser
+from rl_yardstick.commands.terminal import say, table_console
 from rl_yardstick.pipeline.errors import UserError, as_user_error
 
 
@@ -16,7 +17,6 @@ def main() -> int:
     parser.add_argument("model", type=Path, metavar="ZIP", help="zip of an agent")
     path = parser.parse_args().model
 
-    from rl_yardstick.commands.terminal import say, table_console
     from rl_yardstick.safe_files.models import inspect_model
 
     if not path.exists():

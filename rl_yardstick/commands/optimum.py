@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
+from rl_yardstick.commands.terminal import say, scale_lines, table_console
 from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -42,31 +42,22 @@ def main() -> int:
     from rl_yardstick.envs import found_models
 
     found_models.limit(args.exact_model, args.ignore, args.starts)
-    from rl_yardstick.commands.terminal import say, table_console
-    from rl_yardstick.pipeline.files import write_json
     from rl_yardstick.pipeline.settings import parse_assignments
 
-    found = optimum_of(args.env, parse_assignments(args.env_kwargs, "--env-kwargs"))
-    say(table_console(), "\n".join(found.lines))
-    if args.json is not None:
-        write_json(args.json, {"env": args.env, **found.figures})
+    found, lines = optimum_of(args.env, parse_assignments(args.env_kwargs, "--env-kwargs"))
+    say(table_console(), "\n".join(lines))
+    cli.write_result(args, {"env": args.env, **found})
     return 0
 
 
-@dataclass(frozen=True)
-class Optimum:
-    """The optimum of an environment: figures by name, and lines to print."""
+def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """The optimum of an environment: figures by name, and lines to print.
 
-    figures: dict[str, Any]
-    lines: list[str]
-
-
-def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> Optimum:
-    """The optimum of an environment; UserError where its model is not known."""
+    Raises UserError where its model is not known.
+    """
     import numpy as np
 
     from rl_yardstick import mdp
-    from rl_yardstick.commands.terminal import scale_lines
     from rl_yardstick.envs import known_models as known
     from rl_yardstick.pipeline.environments import with_files_read
     from rl_yardstick.pipeline.evaluation.exact import known_model
@@ -98,7 +89,7 @@ def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> Optimum:
     figures = {"optimum": best, "baseline": baseline, "horizon": horizon, "states": n_states}
     seconds = None if search is None else search.seconds
     found = {**figures, "seconds": seconds, "values": values, "actions": actions}
-    return Optimum(found, [*filter(None, lines)])
+    return found, [*filter(None, lines)]
 
 
 def _first_actions(world: World, starts: Ints, actions: Bools) -> Iterator[str]:

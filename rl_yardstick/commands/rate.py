@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
+from rl_yardstick.commands.terminal import result_lines, say, table_console
 from rl_yardstick.pipeline.errors import UserError, unknown
 
 if TYPE_CHECKING:
@@ -51,8 +52,7 @@ def main() -> int:
     """Rate files."""
     args = build_parser().parse_args()
     cli.import_typed(args)
-    from rl_yardstick.commands.terminal import result_lines, say, table_console
-    from rl_yardstick.pipeline.files import write_json, write_text
+    from rl_yardstick.pipeline.files import write_text
     from rl_yardstick.report.words import why_lines
 
     console = table_console()
@@ -71,9 +71,8 @@ def main() -> int:
 
         frame = pd.DataFrame(rows, columns=COLUMNS)
         write_text(args.table, frame.to_csv(index=False, lineterminator="\n"))
-    if args.json is not None:
-        told = {k: one if isinstance(one, str) else one.as_data() for k, one in rated.items()}
-        write_json(args.json, told)
+    told = {k: one if isinstance(one, str) else one.as_data() for k, one in rated.items()}
+    cli.write_result(args, told)
     return 0
 
 

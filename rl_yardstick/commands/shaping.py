@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.commands import cli
 from rl_yardstick.commands.cli import OneLineParser, flag, several, shared
-from rl_yardstick.commands.train import entry_from_flags
+from rl_yardstick.commands.terminal import TextConsole, say
 from rl_yardstick.pipeline.errors import UserError, as_user_error
 
 if TYPE_CHECKING:
@@ -48,16 +48,14 @@ def build_parser() -> OneLineParser:
         *shared("--hyperparams", "--conf-file", "--gym-packages", "--json"),
     )
     parser = OneLineParser(words, EPILOG, {"": flags})
-    parser.set_defaults(n_timesteps=1, n_episodes=-1, engine=None, eval_env_kwargs=[])
+    parser.set_defaults(n_timesteps=1)
     return parser
 
 
 def main() -> int:
     """Print the effect of the training rewards."""
     args = build_parser().parse_args()
-    from rl_yardstick.commands.terminal import TextConsole, say
     from rl_yardstick.pipeline.environments import make_single_env, training_changes
-    from rl_yardstick.pipeline.files import write_json
 
     console = TextConsole()
     spec = _spec(args)
@@ -70,7 +68,7 @@ def main() -> int:
         for line in compared.lines():
             say(console, line)
         if args.json is not None:
-            write_json(args.json, {"changes": changes, **compared.as_data()})
+            cli.write_result(args, {"changes": changes, **compared.as_data()})
     return 0
 
 
@@ -78,20 +76,20 @@ def main() -> int:
 
 
 def _spec(args: argparse.Namespace) -> TrainSpec:
-    from rl_yardstick.pipeline.environments import check_env_id, with_files_read
-    from rl_yardstick.pipeline.settings import check_agent, parse_assignments, read_spec
+    from rl_yardstick.pipeline import settings
+    from rl_yardstick.pipeline.environments import check_env_id
 
     cli.import_typed(args)
-    check_agent(args.algo)
+    settings.check_agent(args.algo)
     check_env_id(args.env)
-    entry, _ = entry_from_flags(args)
+    typed, read = cli.typed_settings(args, "-params"), settings.parse_assignments
+    entry, _ = settings.changed_entry(args.algo, args.env, args.conf_file, typed)
     if args.train_env_kwargs or args.wrapper:
-        entry["train_env_kwargs"] = parse_assignments(args.train_env_kwargs, "--train-env-kwargs")
+        entry["train_env_kwargs"] = read(args.train_env_kwargs, "--train-env-kwargs")
         entry["train_env_wrapper"] = [
-            {name: parse_assignments(kwargs, "--wrapper")} for name, *kwargs in args.wrapper
+            {name: read(kwargs, "--wrapper")} for name, *kwargs in args.wrapper
         ]
-    entry = with_files_read(args.env, entry)
-    spec = read_spec(args.algo, args.env, entry, gym_packages=args.gym_packages)
+    spec = settings.read_spec(args.algo, args.env, entry, gym_packages=args.gym_packages)
     for key in ("normalize", "vec_env_wrapper"):
         if getattr(spec, key):
             raise UserError(f"{key}: the rewards that it makes have no model to compare")

@@ -7,10 +7,13 @@ from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
+from secrets import randbelow
 from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
-from rl_yardstick.commands import cli
+from rl_yardstick.commands import cli, terminal
 from rl_yardstick.commands.cli import Flags, OneLineParser, flag, several, shared, switch
+from rl_yardstick.commands.terminal import APART, percent, say
 from rl_yardstick.pipeline.errors import Stopped, UserError
 
 if TYPE_CHECKING:
@@ -99,25 +102,21 @@ def main() -> int:
     parser = build_parser()
     args = parser.parse_args()
     cli.import_typed(args)
-    from rl_yardstick.commands.terminal import TextConsole, table_console
-
     if args.list:
         from rl_yardstick.report.catalogue import print_lists
 
         is_for_one = any(word.partition("=")[0] == "--env" for word in parser.typed)
-        print_lists(table_console(), args.env if is_for_one else "")
+        print_lists(terminal.table_console(), args.env if is_for_one else "")
         return 0
     from rl_yardstick.pipeline.run import Run, Stop
 
     stop = Stop().listen()
-    console = TextConsole(quiet=args.verbose < 1, force_terminal=args.progress or None)
+    console = terminal.TextConsole(quiet=args.verbose < 1, force_terminal=args.progress or None)
     if args.resume is not None:
         return resume(Run(unfinished_run(args), console, stop), args)
     spec = spec_from_flags(args)
     if args.resume_or_start and (found := newest_run(args, partial(has_spec, spec, args.seed < 0))):
         return resume(Run(found, console, stop), args)
-    from uuid import uuid4
-
     suffix = f"_{uuid4()}" if args.uuid else ""
     run = Run.claim(Path(args.log_folder), spec, suffix, console=console, stop=stop)
     return carry_out(spec, run, args, resumes=False)
@@ -125,7 +124,6 @@ def main() -> int:
 
 def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool) -> int:
     """Hold the folder, train, and print the result."""
-    from rl_yardstick.commands.terminal import say
     from rl_yardstick.pipeline.run import tracked
 
     with run:
@@ -157,8 +155,6 @@ def carry_out(spec: TrainSpec, run: Run, args: argparse.Namespace, resumes: bool
 
 def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
     """The spec that the flags and the hyperparameters ask for; torch is not imported."""
-    from secrets import randbelow
-
     from rl_yardstick.pipeline import environments, settings
 
     settings.check_agent(args.algo)
@@ -166,7 +162,9 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
     cli.check_installed(args.tensorboard_log, "-tb", "tensorboard", "tensorboard")
     cli.check_installed(args.track, "--track", "wandb", "wandb", "tensorboard")
     cli.check_device(args.device)
-    entry, origins = entry_from_flags(args)
+    typed = cli.with_engine(args.algo, cli.typed_settings(args, "-params"), args.engine)
+    changes = trial_from_flags(args), typed
+    entry, origins = settings.changed_entry(args.algo, args.env, args.conf_file, *changes)
     names = (
         *("eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer"),
         *("exact_model", "log_interval", "vec_env", "device", "diagnose", "watch_episodes"),
@@ -175,7 +173,7 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
     spec = settings.read_spec(
         args.algo,
         args.env,
-        environments.with_files_read(args.env, entry),
+        entry,
         seed=args.seed if args.seed >= 0 else randbelow(2**31),
         final_episodes=args.eval_episodes,
         n_threads=args.num_threads,
@@ -184,41 +182,11 @@ def spec_from_flags(args: argparse.Namespace) -> TrainSpec:
         tensorboard_log=args.tensorboard_log or (TRACKED if args.track else None),
         library_log=args.verbose > 1,
         watch_learning=_page(args),
-        map_name=environments.map_name(args.env, entry),
         origins=origins,
         **{name: getattr(args, name) for name in names},
     )
     environments.check_fit(spec)
     return spec
-
-
-def entry_from_flags(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
-    """The entry with the changes of the command line, and notes on dropped settings."""
-    from rl_yardstick.pipeline import settings
-
-    typed = settings.parse_assignments(args.hyperparams, "-params")
-    changes = cli.with_engine(args.algo, typed, args.engine)
-    for key in ("env_kwargs", "eval_env_kwargs"):
-        if given := getattr(args, key):
-            named = settings.parse_assignments(given, f"--{key.replace('_', '-')}")
-            changes[key] = {**(changes.get(key) or {}), **named}
-    for key in ("n_timesteps", "n_episodes"):
-        if (budget := getattr(args, key)) > 0:
-            changes[key] = budget
-    trial = trial_from_flags(args) if "storage" in args else {}  # shaping has no such flag
-    try:
-        entry = settings.read_entry(args.algo, args.env, args.conf_file, changes.get("env_kwargs"))
-    except UserError:
-        if not (changes or trial) or args.conf_file:
-            raise
-        entry = {}
-    entry = settings.override(entry, trial)
-    merged = {
-        key: {**(entry.get(key) or {}), **changes[key]}
-        for key in ("env_kwargs", "eval_env_kwargs")
-        if changes.get(key)
-    }
-    return settings.training_follows(settings.override(entry, {**changes, **merged}), changes)
 
 
 def trial_from_flags(args: argparse.Namespace) -> dict[str, Any]:
@@ -320,8 +288,6 @@ def has_spec(spec: TrainSpec, any_seed: bool, run: Run) -> bool:
 
 def print_header(console: Console, spec: TrainSpec) -> None:
     """Print the agent, the environment, the budget and the hyperparameters."""
-    from rl_yardstick.commands.terminal import say
-
     unit = "steps" if spec.n_timesteps else "episodes"
     budget = spec.n_timesteps or spec.n_episodes or 0
     say(console, f"{spec.algo} on {spec.place}, seed {spec.seed}, {budget:,} {unit}", "bold")
@@ -347,15 +313,13 @@ def print_engine(parts: Training) -> None:
 
 def print_outcome(run: Run, spec: TrainSpec, outcome: Training, args: argparse.Namespace) -> None:
     """Print what was done, below it the result, and the commands to type next."""
-    from rl_yardstick.commands.terminal import describe_others, result_lines, say
-
     console = run.console
     for label, text in rows_of(run, outcome):
         say(console, f"{label:<9}{text}")
     results = [] if outcome.pulled is None else [describe_pulls(outcome.pulled)]
     if (final := outcome.final) is not None:
-        others = describe_others(final.others) if final.others else []
-        results += [*result_lines(final), *(f"also     {line}" for line in others)]
+        others = terminal.describe_others(final.others) if final.others else []
+        results += [*terminal.result_lines(final), *(f"also     {line}" for line in others)]
     say(console, "\n".join(["", *results]) if results else "")
     exact = outcome.judge.exact
     if final and exact is None and hasattr(outcome.agent.observation_space, "n"):
@@ -378,8 +342,6 @@ def print_outcome(run: Run, spec: TrainSpec, outcome: Training, args: argparse.N
 
 def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
     """What was done: labels and figures."""
-    from rl_yardstick.commands.terminal import APART, judged
-
     taken, final = outcome.progress.taken.cpu_seconds, outcome.final
     n_steps, evaluation = outcome.agent.num_timesteps, outcome.evaluation
     speed = f"{n_steps / max(taken, 1e-9):,.0f} steps/s"
@@ -389,7 +351,7 @@ def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
         rows.append(("engine", outcome.engine))
     if evaluation.best is not None:
         yardstick = None if final is None else final.yardstick
-        best = judged(evaluation.best, yardstick, evaluation.best_episodes)
+        best = terminal.judged(evaluation.best, yardstick, evaluation.best_episodes)
         rows.append(("best", APART.join([*best, f"at step {evaluation.best_timesteps:,}"])))
     if final is not None:
         share = outcome.evaluation_steps / max(n_steps, 1)
@@ -401,7 +363,6 @@ def rows_of(run: Run, outcome: Training) -> list[tuple[str, str]]:
 
 def describe_pulls(pulls: PullSummary) -> str:
     """The regret of a training in a few words."""
-    from rl_yardstick.commands.terminal import APART, percent
     from rl_yardstick.pipeline.run import LAST_PULLS
 
     if pulls.regret is not None and pulls.optimal is not None:

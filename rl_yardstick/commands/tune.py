@@ -16,9 +16,9 @@ from rl_yardstick.commands import cli, compare
 from rl_yardstick.commands.cli import Flags, OneLineParser, flag, seconds, shared, switch
 from rl_yardstick.commands.compare import Job, held
 from rl_yardstick.commands.terminal import say, table_console
+from rl_yardstick.experiments.study import AgentSpec, with_maps_named
 from rl_yardstick.pipeline.errors import Stopped
 from rl_yardstick.tuning.tuning_spec import (
-    AUTO,
     FIGURES,
     OBJECTIVES,
     PRUNERS,
@@ -44,6 +44,9 @@ The same command again continues the search.
 """
 
 SEEDS, TRIALS, STARTUP = (cli.whole_number(*ends) for ends in ((1, 1000), (1, 10**5), (0, 10**5)))
+# Flags that set the field of `StudySpec` with their name, as --gym-packages does.
+OF_STUDY = ("name", "first_seed", "eval_freq", "eval_episodes", "threshold", "run_timeout")
+METRIC = "figure of a run (default: score, return or regret)"
 FOLDER = "-f --log-folder --optimization-log-path"  # as in rl_zoo3
 FLAGS: Flags = {
     "": (
@@ -55,7 +58,7 @@ FLAGS: Flags = {
         flag("--seeds-per-trial", "seeds of each trial (5)", SEEDS, 5),
         flag("--first-seed", "the first of these seeds (0)", cli.FIRST_SEED, 0),
         flag("--objective", "value of a trial by its runs", default="mean", choices=OBJECTIVES),
-        flag("--metric", "figure of a run (default: score, return or regret)", choices=FIGURES),
+        flag("--metric", METRIC, choices=FIGURES, dest="figure"),
         flag("--threshold", "the return that counts as solved", float, metavar="RETURN"),
         flag("--sampler", "what suggests settings (tpe)", default="tpe", choices=SAMPLERS),
         flag("--pruner", "whether hopeless trials end early", default="auto", choices=PRUNERS),
@@ -99,29 +102,18 @@ def build_parser() -> OneLineParser:
 
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     """The search that the arguments ask for."""
-    from rl_yardstick.experiments.study import AgentSpec, with_maps_named
-
     cli.check_installed(True, "tuning", "tune", "optuna")
     study = compare.study_of([args.algo], [args.env])
     # The settings that the command line fixes.
-    settings = cli.with_engine(args.algo, compare.typed_settings(args), args.engine)
-    study = replace(
-        study,
-        name=args.name or study.name,
-        agents=(AgentSpec(SHIPPED, args.algo, settings, conf_file=args.conf_file),),
-        n_seeds=args.seeds_per_trial,
-        first_seed=args.first_seed,
-        eval_freq=args.eval_freq,
-        eval_episodes=args.eval_episodes,
-        threshold=args.threshold,
-        gym_packages=tuple(args.gym_packages),
-        run_timeout=args.run_timeout,
-    )
+    settings = cli.with_engine(args.algo, cli.typed_settings(args, "--hyperparams"), args.engine)
+    agent = AgentSpec(SHIPPED, args.algo, settings, conf_file=args.conf_file)
+    given = cli.given(args, (*OF_STUDY, "gym_packages"))
+    study = replace(study, agents=(agent,), n_seeds=args.seeds_per_trial, **given)
     study = with_maps_named(study)
     title = f"{args.algo} on {study.environments[0].label}: a search for settings"
     # A flag with the name of a field sets that field.
-    named = {key.name: getattr(args, key.name) for key in fields(TuningSpec) if key.name in args}
-    tuning = TuningSpec(**named, study=replace(study, title=title), figure=args.metric or AUTO)
+    named = cli.given(args, (key.name for key in fields(TuningSpec)))
+    tuning = TuningSpec(study=replace(study, title=title), **named)
     tuning.check()
     return tuning
 

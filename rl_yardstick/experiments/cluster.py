@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+from collections.abc import Collection
 from concurrent.futures import Future
 from functools import cached_property
 from pathlib import Path
@@ -60,7 +61,7 @@ class ClusterWorkers(Workers):
         self.n_at_once = 2 * max(len(self._client.scheduler_info(-1)["workers"]), 1)
         return future
 
-    def end(self) -> None:
+    def end(self, under_way: Collection[Future[None]] = ()) -> None:
         """Give back the workers; Dask sends them a SIGTERM."""
         if "_client" in vars(self):
             self._client.close(timeout=5)

@@ -367,8 +367,7 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
         for policy in policies
     ]
     for arm in range(data.n_arms):
-        always = np.zeros(predicted.shape)
-        always[:, arm] = 1
+        always = np.tile(np.eye(n_arms)[arm], (len(data), 1))
         try:
             rows.append(Judged(f"always arm {arm}", _judge(data, f"arm {arm}", always, predicted)))
         except UserError as error:

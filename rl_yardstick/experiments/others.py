@@ -7,7 +7,6 @@ import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from rl_yardstick.experiments import results
 from rl_yardstick.experiments.analysis import MARGIN
 from rl_yardstick.experiments.logs import TRAINING, WORDS, Log
 from rl_yardstick.experiments.plan import PlannedRun
-from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, Metric, StudySpec
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline.environments import MISTAKES
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
@@ -34,19 +33,7 @@ PATTERNS = (
     *("{env}_{agent}_{seed}", "{agent}/{env}", "{env}/{agent}", "{agent}/{seed}"),
     *("{agent}_{seed}", "{agent}"),
 )
-
-
-@dataclass(frozen=True)
-class Options:
-    """How logs are read and judged."""
-
-    pattern: str = ""  #: where paths have agent, env and seed; empty for one of `PATTERNS`
-    columns: Mapping[str, str] = field(default_factory=dict)  #: a table's own, by the usual names
-    env: str = "environment"  #: the environment of runs whose logs name none
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)  #: its arguments, for the optimum
-    metric: Metric = "final"  #: the figure that verdicts compare
-    margin: float | None = None  #: the difference within which agents are tied
-    figures: tuple[str, ...] = ("png", "svg")  #: formats of figures
+UNNAMED = "environment"  # of logs that name none
 
 
 # --- agent, environment and seed ------------------------------------------------------------------
@@ -64,29 +51,29 @@ def labels_in(place: str, pattern: str, forms: Mapping[str, str] = FORMS) -> dic
     return {} if found is None else found.groupdict()
 
 
-def _labelled(logs: Sequence[Log], notes: list[str], options: Options) -> list[Log]:
+def _labelled(logs: Sequence[Log], notes: list[str], pattern: str, env: str) -> list[Log]:
     """The logs with all labels, in order, one for each agent, environment and seed."""
-    patterns = [options.pattern] if options.pattern else [*PATTERNS]
-    forms = {**FORMS, "env": "[^/]+?"} if options.pattern else FORMS
+    patterns = [pattern] if pattern else [*PATTERNS]
+    forms = {**FORMS, "env": "[^/]+?"} if pattern else FORMS
     used, runs = Counter[str](), dict[tuple[str, ...], Log]()
     for log in logs:
         if "agent" not in log.labels:
             place = str(log.path.with_suffix("")) if log.labels else log.place
             read = ((one, labels_in(place, one, forms)) for one in patterns)
-            pattern, in_path = next((pair for pair in read if pair[1]), ("", {}))
+            fitting, in_path = next((pair for pair in read if pair[1]), ("", {}))
             if not in_path:
-                raise UserError(f"--pattern {options.pattern} does not fit {place}")
+                raise UserError(f"--pattern {pattern} does not fit {place}")
             log.labels = {**in_path, **log.labels}
-            used[pattern] += 1
+            used[fitting] += 1
         seed = re.sub(r"^\D+(?=\d+$)", "", log.labels.get("seed", ""))
-        environment = log.labels.get("env") or log.env or options.env
+        environment = log.labels.get("env") or log.env or env
         log.labels = {"agent": log.labels["agent"], "env": environment}
         key = (*log.labels.values(), seed.zfill(20), "" if seed else log.place)
         if (other := runs.setdefault(key, log)) is not log:
             both = f"{', '.join([*log.labels.values(), seed])}: {other.place} and {log.place}"
             raise UserError(f"two runs are {both}; --pattern splits them")
-    for pattern, n in used.items():
-        notes.append(f"labels of {n:,} from their paths, by --pattern '{pattern}'")
+    for fitting, n in used.items():
+        notes.append(f"labels of {n:,} from their paths, by --pattern '{fitting}'")
     return [runs[key] for key in sorted(runs)]
 
 
@@ -94,16 +81,22 @@ def _labelled(logs: Sequence[Log], notes: list[str], options: Options) -> list[L
 
 
 def results_of(
-    every: Sequence[Log], notes: list[str], options: Options, root: Path
+    every: Sequence[Log],
+    notes: list[str],
+    root: Path,
+    pattern: str = "",
+    env: str = UNNAMED,
+    env_kwargs: Mapping[str, Any] | None = None,
 ) -> results.StudyResults:
     """The logs as the results of a study in the folder ``root``; adds to the notes.
 
-    Raises UserError if labels are missing, or are those of two runs.
+    ``pattern`` tells where paths have agent, env and seed, ``env`` and ``env_kwargs`` belong to
+    logs that name none. Raises UserError if labels are missing, or are those of two runs.
     """
     counts, half = Counter(kind for log in every for kind in log.figures), len(every) // 2
     # The first that more than half of the runs have, or else most.
     kind = max([*WORDS, *counts], key=lambda kind: min(counts[kind], half + 1))
-    logs = _labelled([log for log in every if kind in log.figures], notes, options)
+    logs = _labelled([log for log in every if kind in log.figures], notes, pattern, env)
     is_last = any(len(log.evaluations.steps) for log in logs)
     words = WORDS.get(kind) or f"{'last ' if is_last else ''}{kind}"
     notes.append(f"figure of each run: {'mean ' if kind in WORDS else ''}{words}")
@@ -113,16 +106,17 @@ def results_of(
     agents = list(dict.fromkeys(agent for agent, _ in labels))
     if len(agents) == 1:
         notes.append(f"one agent only, {agents[0]}: a comparison needs two")
-    if Options.env in (env for _, env in labels):
+    if UNNAMED in (place for _, place in labels):
         notes.append("no log names its environment: --env gives it")
-    places = {env: _place(env, logs, options) for env in dict.fromkeys(env for _, env in labels)}
-    for agent, env in dict.fromkeys(labels):
-        own, scale = {"agent": agent, "env": env}, places[env][1]
+    names = dict.fromkeys(place for _, place in labels)
+    places = {place: _place(place, logs, env_kwargs) for place in names}
+    for agent, place in dict.fromkeys(labels):
+        own, scale = {"agent": agent, "env": place}, places[place][1]
         finals: Any = pd.Series([log.figures[kind] for log in logs if log.labels == own])
         if scale and finals.mean() - 6 * finals.sem() > scale.optimum + MARGIN * abs(scale.optimum):
-            above = f"{env}: returns of {agent} above the optimum {scale.optimum:.4g}"
+            above = f"{place}: returns of {agent} above the optimum {scale.optimum:.4g}"
             notes.append(f"{above}: another environment or other arguments; --env-kwargs")
-            places[env] = _place("", (), options)
+            places[place] = _place("", (), None)
     seeds = [labels[:k].count(one) for k, one in enumerate(labels)]
     study = StudySpec(
         name=root.name,
@@ -130,15 +124,12 @@ def results_of(
         agents=tuple(AgentSpec(agent, "") for agent in agents),
         environments=tuple(EnvironmentSpec(one, spec.env_id) for one, (spec, _) in places.items()),
         n_seeds=max(seeds) + 1,
-        metric=options.metric,
-        margin=options.margin,
-        figures=options.figures,
         figure=words,
     )
     planned, rows, curves = list[PlannedRun](), list[dict[str, Any]](), list[results.Curve]()
-    for (agent, env), seed, log in zip(labels, seeds, logs, strict=True):
-        spec, scale = places[env]
-        planned.append(PlannedRun(agent, env, seed, spec, Path(log.place)))
+    for (agent, place), seed, log in zip(labels, seeds, logs, strict=True):
+        spec, scale = places[place]
+        planned.append(PlannedRun(agent, place, seed, spec, Path(log.place)))
         row, *of_run = _read(study, planned[-1], log, log.figures[kind], scale)
         rows.append(row)
         curves += of_run
@@ -152,7 +143,9 @@ def results_of(
     return results.StudyResults(study, root, table, results.joined(curves), tuple(planned))
 
 
-def _place(place: str, logs: Sequence[Log], options: Options) -> tuple[TrainSpec, Yardstick | None]:
+def _place(
+    place: str, logs: Sequence[Log], given: Mapping[str, Any] | None
+) -> tuple[TrainSpec, Yardstick | None]:
     """The environment of runs and its scale; the id is empty if it is not known, or differs by run.
 
     A log imports no module: only Gymnasium's and this project's, and those imported before, count.
@@ -160,7 +153,7 @@ def _place(place: str, logs: Sequence[Log], options: Options) -> tuple[TrainSpec
     from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single
     from rl_yardstick.pipeline.evaluation.sampled import bracketed_yardstick
 
-    given, unknown = options.env_kwargs, validated({"algo": "", "env_id": "", "n_timesteps": 1})
+    unknown = validated({"algo": "", "env_id": "", "n_timesteps": 1})
     kwargs = [dict(given or log.env_kwargs) for log in logs if log.labels["env"] == place]
     entry = gym.registry[place].entry_point if place in gym.registry else None
     module = entry.partition(":")[0] if isinstance(entry, str) else "rl_yardstick."

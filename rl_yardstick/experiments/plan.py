@@ -21,10 +21,9 @@ from rl_yardstick.experiments.study import (
     QuickSpec,
     StudySpec,
     file_name,
-    layered,
 )
 from rl_yardstick.pipeline import environments, settings
-from rl_yardstick.pipeline.errors import UserError, as_user_error
+from rl_yardstick.pipeline.errors import UserError, as_user_error, shown
 from rl_yardstick.pipeline.files import plain, read_json, write_json
 from rl_yardstick.pipeline.run import FINISHED, Run
 from rl_yardstick.pipeline.spec import TrainSpec
@@ -190,14 +189,16 @@ def _is_batch(spec: TrainSpec) -> bool:
 
 
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
+    place, changes = (agent.algo, environment.env_id), (environment.settings, agent.settings)
     settings.check_agent(agent.algo)
-    entry, origins = _entry(agent, environment)
+    if agent.tuned or agent.conf_file is not None:
+        entry, origins = settings.changed_entry(*place, agent.conf_file, *changes)
+    else:
+        entry, origins = settings.layered(*changes), {}
     spec = settings.read_spec(
-        agent.algo,
-        environment.env_id,
-        environments.with_files_read(environment.env_id, entry),
+        *place,
+        entry,
         origins=origins,
-        map_name=environments.map_name(environment.env_id, entry),
         pictures=False,
         eval_freq=study.eval_freq,
         eval_episodes=study.eval_episodes,
@@ -225,22 +226,6 @@ def _quickened(spec: TrainSpec, quick: QuickSpec) -> dict[str, int]:
             less = min(budget, most) if quick.budget is None else round(budget * quick.budget)
             found[key] = max(less, 1)
     return found
-
-
-def _entry(agent: AgentSpec, environment: EnvironmentSpec) -> tuple[dict[str, Any], dict[str, str]]:
-    """The entry of the agent's file, changed by the environment's settings, then by the agent's."""
-    entry: dict[str, Any] = {}
-    own = layered(environment.settings, agent.settings)
-    if agent.tuned or agent.conf_file is not None:
-        kwargs = own.get("env_kwargs")
-        try:
-            entry = settings.read_entry(agent.algo, environment.env_id, agent.conf_file, kwargs)
-        except UserError:
-            if agent.conf_file is not None or not (agent.settings or environment.settings):
-                raise
-    # The environment's settings remove keys with None before the agent's settings apply.
-    kept = {k: value for k, value in entry.items() if environment.settings.get(k, k) is not None}
-    return settings.training_follows(layered(kept, own), own)
 
 
 # --- the record of a study ------------------------------------------------------------------------
@@ -331,11 +316,18 @@ def look_sizes(first: int, most: int) -> tuple[int, ...]:
     return tuple(sizes)
 
 
-def other_settings(planned: Sequence[PlannedRun]) -> list[tuple[PlannedRun, dict[str, Any]]]:
-    """The finished runs in the folders that have other settings than planned, and these."""
+def check_settings_kept(root: Path, planned: Sequence[PlannedRun]) -> None:
+    """Refuse a study in whose folder runs have finished with other settings."""
     recorded = [(run, run.recorded()) for run in planned]
     finished = [(run, found) for run, found in recorded if found.get("state") == FINISHED]
-    return [(run, there) for run, found in finished if (there := run.differences(found))]
+    others = [there for run, found in finished if (there := run.differences(found))]
+    if others:
+        pairs = {key: pair for settings in others for key, pair in settings.items()}
+        named = [f"{key}: {shown(a)} there, {shown(b)} now" for key, (a, b) in pairs.items()]
+        words = "; ".join(named[:3]) + ("; ..." if len(named) > 3 else "")
+        runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
+        fault = f"{root}: {runs} other settings ({words})"
+        raise UserError(f"{fault}: give the study another folder by --name NAME")
 
 
 # --- the seeds of a study on which its settings were tuned, as far as known -----------------------
@@ -372,7 +364,7 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
     for agent, environment in product(study.agents, study.environments):
         label = agent.group or agent.label
         tuned_on = known(agent.algo, environment.env_id, agent.conf_file)
-        own = layered(environment.settings, agent.settings)
+        own = settings.layered(environment.settings, agent.settings)
         as_it_comes = {key for key in AS_IT_COMES if own.get(key) is None}
         if {*own} - _NO_TUNING - as_it_comes or tuned_on is None:
             unknown[label] = None
@@ -392,12 +384,12 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
 
 def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:
     """Whether the study has environment arguments that the entry does not have."""
-    own = layered(environment.settings, agent.settings)
+    own = settings.layered(environment.settings, agent.settings)
     places = agent.algo, environment.env_id, agent.conf_file
     entry = settings.read_entry(*places, own.get("env_kwargs"))
     if entry != settings.read_entry(*places):  # the entry of another id of the same environment
         del own["env_kwargs"]
-    merged, usual = layered(entry, own), environments.usual_kwargs(environment.env_id)
+    merged, usual = settings.layered(entry, own), environments.usual_kwargs(environment.env_id)
 
     def meant(given: Mapping[str, Any], key: str) -> Any:
         value = given.get(key) or {}

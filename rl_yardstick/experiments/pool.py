@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache, partial
@@ -45,10 +45,13 @@ def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> 
         Stopped: after a SIGTERM; the state of the training is saved.
     """
     spec, path = planned.spec, planned.path
+    before = signal.getsignal(signal.SIGTERM)
+    # Ctrl-C reaches all processes, and is the driver's to heed.
+    asked = Stop().listen(signal.SIGTERM) if stop is None else stop
     try:
         import_modules(spec.gym_packages)
         path.mkdir(parents=True, exist_ok=True)
-        with _sigterm_noticed(stop) as asked, Run(path, stop=asked) as run:
+        with Run(path, stop=asked) as run:
             if planned.is_finished:
                 return
             resumes = _can_resume(planned, run)
@@ -69,6 +72,9 @@ def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> 
         with suppress(OSError):
             (path / ERROR_FILE).write_text(traceback.format_exc(), encoding="utf-8")
         raise UserError(f"{one_line(error)}; see {path / ERROR_FILE}") from None
+    finally:
+        if stop is None:
+            signal.signal(signal.SIGTERM, before)
 
 
 def _can_resume(planned: PlannedRun, run: Run) -> bool:
@@ -90,19 +96,6 @@ def _clear(planned: PlannedRun) -> None:
         shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)
 
 
-@contextmanager
-def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
-    """The request to stop; Ctrl-C reaches all processes, and is the driver's to heed."""
-    if stop is not None:
-        yield stop
-        return
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        yield Stop().listen(signal.SIGTERM)
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 # --- workers on this machine ----------------------------------------------------------------------
 
 
@@ -117,13 +110,11 @@ class Workers(AbstractContextManager["Workers"]):
 
     def __init__(self, n_at_once: int, timeout: float | None = None) -> None:
         if n_at_once < 1:  # as many as there are cores that this process may use
-            n_at_once = os.cpu_count() or 1
-            if hasattr(os, "sched_getaffinity"):
-                n_at_once = len(os.sched_getaffinity(0))
+            cores = getattr(os, "sched_getaffinity", None)
+            n_at_once = len(cores(0)) if cores else os.cpu_count() or 1
         self.n_at_once, self.timeout = n_at_once, timeout
         self.words = f"{n_at_once} at once"
         self._pool: ProcessPool | None = None
-        self._under_way: list[Future[None]] = []
 
     def __exit__(self, *error: object) -> None:
         self.end()
@@ -133,16 +124,15 @@ class Workers(AbstractContextManager["Workers"]):
         if self._pool is None:
             self._pool = process_pool(self.n_at_once)
         future: Future[None] = self._pool.submit(do_run, self.timeout, planned, command)
-        self._under_way = [*(one for one in self._under_way if not one.done()), future]
         return future
 
-    def end(self) -> None:
-        """Let running runs save their states, and end the workers."""
+    def end(self, under_way: Collection[Future[None]] = ()) -> None:
+        """Let runs that are under way save their states, and end the workers."""
         if self._pool is not None:
             for process in multiprocessing.active_children():
                 if process.name.startswith("pebble"):
                     process.terminate()
-            wait(self._under_way, timeout=GRACE)
+            wait(under_way, timeout=GRACE)
             self._pool.stop()  # type: ignore[no-untyped-call]
             self._pool.join()
             self._pool = None
@@ -239,25 +229,24 @@ def keep_busy(
         Stopped: after a signal.
     """
     under_way = dict[Future[None], PlannedRun]()
-    while True:
-        # No more than there are workers: what waits in a pool is begun even after a stop.
-        while len(under_way) < workers.n_at_once and not stop.number:
-            if (run := next_run()) is None:
-                break
-            under_way[workers.submit(run, command)] = run
-        if not under_way:
+    try:
+        while True:
+            # No more than there are workers: what waits in a pool is begun even after a stop.
+            while len(under_way) < workers.n_at_once and not stop.number and (run := next_run()):
+                under_way[workers.submit(run, command)] = run
+            done = wait(under_way, timeout=0.2, return_when=FIRST_COMPLETED).done
             stop.check()
-            return
-        done = wait(under_way, timeout=0.2, return_when=FIRST_COMPLETED).done
-        if stop.number:
-            workers.end()
+            if not under_way:
+                return
+            for future in done:
+                run, error = under_way.pop(future), future.exception()
+                if error is not None:
+                    _mark_interrupted([run])
+                ended(run, "" if error is None else _in_words(error, run, workers.timeout))
+    finally:
+        if under_way:
+            workers.end(under_way)
             _mark_interrupted(under_way.values())
-            stop.check()
-        for future in done:
-            run, error = under_way.pop(future), future.exception()
-            if error is not None:
-                _mark_interrupted([run])
-            ended(run, "" if error is None else _in_words(error, run, workers.timeout))
 
 
 def _mark_interrupted(runs: Iterable[PlannedRun]) -> None:

@@ -100,14 +100,6 @@ LAST_EPISODES = 100
 
 
 @dataclass(frozen=True)
-class LeftOut:
-    """A run that is left out because one of its files cannot be read."""
-
-    planned: PlannedRun  #: the run
-    reason: str  #: the file and its fault, in one line
-
-
-@dataclass(frozen=True)
 class RunResults:
     """The results of one finished run or batch."""
 
@@ -125,7 +117,7 @@ class StudyResults:
     curves: pd.DataFrame  #: learning curves of all runs, see `CURVE_COLUMNS`
     planned: tuple[PlannedRun, ...]  #: all runs of the study, including failed ones
     pulls: Mapping[Labels, PullStatistics] = field(default_factory=dict)  #: on bandits
-    left_out: tuple[LeftOut, ...] = ()  #: finished runs with files that cannot be read
+    left_out: Mapping[Path, str] = field(default_factory=dict)  #: files that cannot be read, by run
     finished: tuple[PlannedRun, ...] = ()  #: the runs in the results
     failures: Mapping[Path, str] = field(default_factory=dict)  #: why runs have just failed
 
@@ -150,39 +142,30 @@ RUN_COLUMNS = (
 )
 
 
-def read_results(
-    study: StudySpec,
-    planned: Sequence[PlannedRun],
-    root: Path,
-    known: dict[tuple[Path, int], RunResults] | None = None,
-) -> StudyResults:
-    """Read all finished runs, except runs with files that cannot be read.
-
-    ``known`` has the runs that have been read before; those that are read now are added.
-    """
-    known = {} if known is None else known
-    done, left_out = [], []
+def read_results(study: StudySpec, planned: Sequence[PlannedRun], root: Path) -> StudyResults:
+    """Read all finished runs, except runs with files that cannot be read."""
+    done, rows, left_out = list[PlannedRun](), list[dict[str, Any]](), dict[Path, str]()
+    curves = list[Curve]()
     for run in planned:
         try:
-            results = known.get((run.path, run.n_runs)) or read_run(study, run)
+            results = read_run(study, run)
         except (UserError, OSError) as error:
-            left_out.append(LeftOut(run, one_line(error)))
+            left_out[run.path] = one_line(error)
             continue
         if results is not None:
-            known[run.path, run.n_runs] = results
             done.append(run)
-    found = [known[run.path, run.n_runs] for run in done]
-    rows = [row for results in found for row in results.rows]
+            rows += results.rows
+            curves += results.curves
     is_hidden = any(row.get("full_optimum") is not None for row in rows)
     columns = [*RUN_COLUMNS, *(HIDDEN_COLUMNS if is_hidden else ())]
     return StudyResults(
         study,
         root,
         pd.DataFrame(rows, columns=columns),
-        joined([curve for results in found for curve in results.curves]),
+        joined(curves),
         tuple(planned),
         read_pulls(done),
-        tuple(left_out),
+        left_out,
         tuple(done),
     )
 

@@ -21,8 +21,7 @@ from rl_yardstick.pipeline.errors import UserError, as_user_error, shown, unknow
 from rl_yardstick.pipeline.files import plain, portable_name
 from rl_yardstick.pipeline.settings import (
     BUDGETS,
-    ENV_KWARGS,
-    override,
+    layered,
     parse_assignments,
     read_yaml,
     shipped_hyperparams,
@@ -70,16 +69,6 @@ def file_name(label: str) -> str:
     return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_")
 
 
-def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings with ``changes`` applied; arguments of environments are merged one by one."""
-    merged = {
-        key: {**settings[key], **changes[key]}
-        for key in ENV_KWARGS
-        if isinstance(settings.get(key), dict) and isinstance(changes.get(key), dict)
-    }
-    return override(settings, {**changes, **merged})
-
-
 def _number(value: Any) -> Any:
     """YAML reads 1e5 as text, and Python counts True as 1."""
     if isinstance(value, bool):
@@ -101,9 +90,7 @@ class AgentSpec:
     label: str  #: its name in tables and figures
     algo: str  #: its name in the table of agents
     settings: dict[str, Any] = field(default_factory=dict)  #: which override those of its file
-    tuned: bool = (
-        True  #: whether to start from the shipped file, or from the constructor's defaults
-    )
+    tuned: bool = True  #: whether to start from the shipped file, or else from the defaults
     conf_file: Path | None = None  #: another file of hyperparameters to start from
     summary: str = ""  #: a short description for the report
     where: str = field(default="", compare=False)  #: the file with its settings, for messages
@@ -224,9 +211,9 @@ def _as_texts(values: Sequence[Any]) -> list[str]:
 # --- study files ----------------------------------------------------------------------------------
 
 
-def _seconds(value: Any) -> Any:
+def seconds(value: Any) -> float:
     """A time such as 90, 90s, 10m, 2h or 1d."""
-    found = re.fullmatch(r"(\d*\.?\d+)\s*(|s|m|min|h|d)", str(value).strip())
+    found = re.fullmatch(r"(\d*\.?\d+(?:e\d+)?)\s*(|s|m|min|h|d)", str(value).strip())
     if found is None or not float(found[1]) > 0:
         raise ValueError(f"must be a time such as 90s, 10m or 2h, not {shown(value)}")
     units = {"m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -305,10 +292,9 @@ class _File(_Part):
     threshold: _Float | None = None
     episodes_table: _FromZero = 0
     diagnose: bool = False
-    run_timeout: Annotated[float, BeforeValidator(_seconds)] | None = None
+    run_timeout: Annotated[float, BeforeValidator(seconds)] | None = None
 
 
-_LISTS = ("agents", "environments")
 # Keys that mean the same as fields of `StudySpec`.
 _SAME = (
     *("description", "eval_freq", "eval_episodes", "metric", "margin", "shared_randomness"),
@@ -339,15 +325,14 @@ def read_study(path: Path) -> StudySpec:
     data = read_yaml(path)
     if not (isinstance(data, dict) and all(isinstance(key, str) for key in data)):
         raise UserError(f"{path}: a study must map names to values")
-    # What is not given is read too: lists of names that are missing.
-    data = dict.fromkeys(_LISTS) | {k: v for k, v in data.items() if v is not None}
-    try:
-        file = _File.model_validate(data)
+    given = {key: value for key, value in data.items() if value is not None}
+    try:  # lists of names that are missing are read too
+        file = _File.model_validate({"agents": None, "environments": None, **given})
     except ValidationError as error:
         raise _in_one_line(path, error) from None
-    given = {key: value for key in BUDGETS if (value := getattr(file, key)) is not None}
+    budgets = file.model_dump(include={*BUDGETS}, exclude_none=True)
     agents = tuple(_agents(path, file))
-    shared, environments = layered(file.settings, given), []
+    shared, environments = layered(file.settings, budgets), []
     for label, entry in file.environments.items():
         env_id = label if entry.id is None else entry.id
         with as_user_error(str(path), UserError):

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from contextlib import closing, suppress
 from copy import deepcopy
-from functools import cache, lru_cache
+from functools import cache, lru_cache, reduce
 from pathlib import Path
 from typing import Any
 
@@ -280,6 +280,32 @@ def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, 
     return {**{key: value for key, value in entry.items() if key not in gone}, **changes}
 
 
+def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with ``changes`` applied; arguments of environments are merged one by one."""
+    merged = {
+        key: {**settings[key], **changes[key]}
+        for key in ENV_KWARGS
+        if isinstance(settings.get(key), dict) and isinstance(changes.get(key), dict)
+    }
+    return override(settings, {**changes, **merged})
+
+
+def changed_entry(
+    algo: str, env_id: str, path: Path | None, *changes: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The entry of `read_entry` with ``changes`` in their order, and notes for `origins`.
+
+    Changes stand alone if the agent's own file has no entry.
+    """
+    entry, own = dict[str, Any](), reduce(layered, changes, dict[str, Any]())
+    try:
+        entry = read_entry(algo, env_id, path, own.get("env_kwargs"))
+    except UserError:
+        if path is not None or not own:
+            raise
+    return training_follows(reduce(layered, changes, entry), own)
+
+
 def training_follows(
     entry: Mapping[str, Any], typed: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, str]]:
@@ -337,13 +363,15 @@ def _components(value: Any, where: str) -> list[dict[str, Any]]:
 
 
 def read_spec(algo: str, env_id: str, entry: Mapping[str, Any], **fields: Any) -> TrainSpec:
-    """The spec of an entry, with numbers in place of ``auto``; its ``origins`` tell how.
+    """The spec of an entry, with files read and numbers for ``auto``; its ``origins`` tell how.
 
     ``fields`` are other fields of `TrainSpec`. Raises UserError for an agent, a key or a value that
     does not exist or does not fit.
     """
     check_agent(algo)
     entry = {key: _read_dict(value) for key, value in entry.items() if value is not None}
+    fields = {"map_name": environments.map_name(env_id, entry), **fields}
+    entry = environments.with_files_read(env_id, entry)
     if all(budget in entry for budget in BUDGETS):
         raise UserError("give n_timesteps or n_episodes, not both")
     special = special_settings(entry)

@@ -23,10 +23,10 @@ from optuna.samplers import BaseSampler, RandomSampler, TPESampler
 from optuna.trial import FrozenTrial
 
 from rl_yardstick.experiments.plan import PlannedRun, plan, specs_of
-from rl_yardstick.experiments.study import AgentSpec, layered
+from rl_yardstick.experiments.study import AgentSpec
 from rl_yardstick.pipeline.components import arguments_of
 from rl_yardstick.pipeline.files import json_text
-from rl_yardstick.pipeline.settings import COMPONENTS
+from rl_yardstick.pipeline.settings import COMPONENTS, layered
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.tuning.search_spaces import SearchSpace, corners
 from rl_yardstick.tuning.tuning_spec import TuningSpec

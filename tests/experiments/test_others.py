@@ -19,7 +19,7 @@ from stable_baselines3.common.monitor import Monitor
 import rl_yardstick as ys
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.logs import find_logs
-from rl_yardstick.experiments.others import PATTERNS, Options, labels_in, results_of
+from rl_yardstick.experiments.others import PATTERNS, labels_in, results_of
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.report.series import learning_curves
 from tests.pipeline.short_runs import Steady, trained
@@ -128,7 +128,7 @@ def test_run_folders_are_judged_as_their_numbers_are(tmp_path, write):
         folder = tmp_path / agent / f"Lake-v7_{seed}"
         folder.mkdir(parents=True)
         write(folder, value)
-    results = results_of(*find_logs([tmp_path], {}), Options(), tmp_path)
+    results = results_of(*find_logs([tmp_path], {}), tmp_path)
     shown = [*FIGURES.values()] if write not in (evaluations, sampled) else [None] * len(FIGURES)
     assert [*results.summary["last_episodes"].replace(np.nan, None)] == shown
     curves = learning_curves(results, analyse(results).environments[0])

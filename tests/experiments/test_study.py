@@ -255,10 +255,10 @@ OTHERS = (
 
 def test_a_run_of_other_settings_does_not_count(tmp_path):
     record(only(PLAIN, tmp_path))
-    assert plans.other_settings([only(PLAIN, tmp_path)]) == []
+    plans.check_settings_kept(tmp_path, [only(PLAIN, tmp_path)])
     assert not any(only(study, tmp_path).is_finished for study in OTHERS)
-    ((_, differences),) = plans.other_settings([only(OTHERS[0], tmp_path)])
-    assert differences["gamma"][1] == 0.123
+    with pytest.raises(UserError, match=r"1 finished run has .*gamma: [\d.]+ there, 0.123 now"):
+        plans.check_settings_kept(tmp_path, [only(OTHERS[0], tmp_path)])
 
 
 DQN, PPO, RANDOM = (AgentSpec(name, name) for name in ("dqn", "ppo", "random"))

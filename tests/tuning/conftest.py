@@ -88,7 +88,7 @@ class Toy:
                 future.set_result(None)
             return future
 
-        workers = SimpleNamespace(n_at_once=n_workers, timeout=None, submit=submit)
+        workers = SimpleNamespace(n_at_once=n_workers, timeout=None, submit=submit, end=len)
         search.deadline = options.pop("deadline", math.inf)
         with suppress(KeyboardInterrupt):
             keep_busy(workers, search.next_run, search.ended, "", Stop())

@@ -257,14 +257,13 @@ def recorded(what: str, infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
 def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
     """Missing runs, grouped by agent, environment and reason: an error's last line."""
     groups: dict[tuple[str, str, str], dict[str, Any]] = {}
-    unreadable = {one.planned.path: one.reason for one in results.left_out}
     there = {*results.summary["path"]}
     for run in results.planned:
         if str(run.path) in there:
             continue
         details, error = results.failures.get(run.path, ""), run.path / ERROR_FILE
         details = (read_text(error) if details and error.exists() else details).strip()
-        reason = unreadable.get(run.path) or details.rpartition("\n")[2] or "not done yet"
+        reason = results.left_out.get(run.path) or details.rpartition("\n")[2] or "not done yet"
         new = {"agent": run.agent, "environment": run.environment, "reason": reason, "seeds": []}
         group = groups.setdefault((run.agent, run.environment, reason), new)
         group["seeds"].append(run.seed)
