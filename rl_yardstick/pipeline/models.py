@@ -25,7 +25,7 @@ from rl_yardstick.pipeline.files import read_bytes
 from rl_yardstick.pipeline.run import RECORD, Run, numbered_runs, statistics_beside
 from rl_yardstick.pipeline.settings import check_agent, read_entry, read_saved, special_settings
 from rl_yardstick.pipeline.spec import TrainSpec, validated
-from rl_yardstick.safe_files.files import first_look
+from rl_yardstick.safe_files.files import read_model
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -167,7 +167,7 @@ def zip_data(path: Path) -> dict[str, Any]:
     """The JSON in an agent's zip; pickles in it stay text."""
     content = read_bytes(path, MAX_MODEL)
     try:
-        return first_look(content)
+        return read_model(content)[1]
     except ValueError as error:
         raise UserError(f"{path} is no agent's zip: it {one_line(error)}") from error
 

@@ -6,7 +6,6 @@ import io
 import json
 import stat
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -114,25 +113,20 @@ def read_members(content: bytes, budget: Budget | None = None) -> dict[str, byte
     return members
 
 
-def read_model_members(content: bytes, budget: Budget) -> dict[str, bytes]:
-    """Read the members of a model's zip; refuses others than models have."""
+def read_model(content: bytes) -> tuple[dict[str, bytes], dict[str, Any], Budget]:
+    """Read a model's zip, without the libraries; refuses members that no model has.
+
+    Returns:
+        the members by name, the settings among them, in which pickles stay text, and the budget
+        that is left.
+    """
+    budget = Budget(len(content))
     members = read_members(content, budget)
     for name in members:
         if name not in _TEXTS and not name.endswith(TENSORS):
             raise UnsafeFileError(f"holds {shown(name)}, which no model file has")
     if SETTINGS not in members or not any(name.endswith(TENSORS) for name in members):
         raise UnsafeFileError("lacks parts that a model has")
-    return members
-
-
-def first_look(content: bytes) -> dict[str, Any]:
-    """Read the settings in a model's zip, without the libraries; pickled settings stay text."""
-    budget = Budget(len(content))
-    return parse_settings(read_model_members(content, budget), budget)
-
-
-def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, Any]:
-    """Parse the settings of a model, which are JSON."""
     budget.charge_json(members[SETTINGS])
     try:
         data = json.loads(members[SETTINGS].decode())
@@ -140,4 +134,4 @@ def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, An
         raise UnsafeFileError(f"has settings that are no JSON: {error}") from error
     if not isinstance(data, dict):
         raise UnsafeFileError("has settings that do not map names to values")
-    return data
+    return members, data, budget

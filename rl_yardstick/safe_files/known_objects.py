@@ -142,15 +142,6 @@ def _flat(pid: Any, content: bytes) -> th.Tensor:
     return tensor
 
 
-def _lone_storage(made: Made, build: Build) -> th.Tensor:
-    """A storage in the legacy format, which PyTorch uses for tensors in other pickles."""
-    file = io.BytesIO(*made.args)
-    reader = pickles.Reader(file, build.budget)
-    # Three headers precede the storage; a list of keys and the size follow it.
-    storage = [reader.load() for _ in range(5)][3]
-    return _flat(storage.args[0], file.read()[8:])
-
-
 def _tensor(made: Made, build: Build) -> th.Tensor:
     storage, offset, shape, strides, requires_grad = build(made.args[:5])
     if math.prod(shape) > len(storage):
@@ -166,7 +157,8 @@ _OF_TENSORS: Mapping[str, Maker] = {
     ),
     "torch._utils._rebuild_tensor_v2": _tensor,
     "torch._utils._rebuild_parameter": lambda made, build: build(made.args[0]),
-    "torch.storage._load_from_bytes": _lone_storage,
+    # A lone storage in a stream, as PyTorch writes those of tensors in other pickles.
+    "torch.storage._load_from_bytes": lambda made, build: load_tensors(*made.args, build.budget),
 }
 
 
