@@ -306,7 +306,7 @@ class EvaluationCallback(EvalCallback):
         before = self.episodes_seen
         self.episodes_seen += int(np.sum(self.locals["dones"]))
         is_due = self.eval_freq > 0 and self.n_calls % self.eval_freq == 0
-        if every := max(self.eval_episode_freq, 0):
+        if every := self.eval_episode_freq:
             is_due |= self.episodes_seen // every > before // every
         if is_due and isinstance(self.evaluator, SampledEvaluator):
             is_due = self.evaluator.can_afford(self.model, self.episodes_seen)

@@ -294,13 +294,14 @@ def _own_classes(algorithm: type[BaseAlgorithm], typed: list[str]) -> Mapping[st
     from stable_baselines3.common.buffers import BaseBuffer
     from torch import nn, optim
 
+    from rl_yardstick.safe_files.known_objects import by_name
+
     kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     homes = tuple(f"{home}." for home in (*map(module_name, typed), algorithm.__module__))
     modules = [one for name, one in list(sys.modules.items()) if f"{name}.".startswith(homes)]
     values = [value for module in modules for value in list(vars(module).values())]
     classes = [one for one in values if isinstance(one, type) and issubclass(one, kinds)]
-    named = {f"{one.__module__}.{one.__qualname__}": one for one in classes}
-    return {name: one for name, one in named.items() if name.startswith(homes)}
+    return {name: one for name, one in by_name(classes).items() if name.startswith(homes)}
 
 
 # --- statistics, and training further -------------------------------------------------------------

@@ -134,8 +134,7 @@ class Training:
             maps = ValueMapRecorder(run.path / "value_maps.npz", exact)
         self.evaluation = callbacks.EvaluationCallback(run, judge, frequencies, maps, critics)
         recorder = watch_of(spec, agent, maps)
-        # What a page plays of the training.
-        self.watch: Watch | None = recorder or (maps if spec.watch_learning else None)
+        self.watch: Watch | None = recorder or maps  # what a page plays of the training
         self.pulls = callbacks.PullRecorder(run.path) if is_bandit else None
         if is_bandit and getattr(agent, "engine", None) == "compiled":  # it stops at no pull
             self.pulls, note = None, "engine: compiled keeps no pulls, so regret is not known"
@@ -210,7 +209,6 @@ class Training:
             evaluation.write()
             if evaluation.value_maps is not None:
                 evaluation.value_maps.finish(agent)
-                self.watch = self.watch or evaluation.value_maps
             if evaluation.critics is not None:
                 evaluation.critics.finish(agent.num_timesteps)
             evaluation.take_statistics()

@@ -63,7 +63,6 @@ class TableRecorder(BlockCallback):
     def __init__(self, n_episodes: int = 0) -> None:
         super().__init__()
         self.n_episodes = n_episodes
-        self.names: list[str] = []  # of the tables
         self.has_actions = False  # whether the first table has a number for each state and action
         self.initial: dict[str, Floats] = {}  # the tables before the first step
         self.steps: list[NDArray[np.void]] = []  # one array of `STEP` and of `MOVE` for each step
@@ -94,8 +93,7 @@ class TableRecorder(BlockCallback):
             return
         if not self.initial:
             self.initial = {name: table.copy() for name, table in tables_of(self.model).items()}
-            self.names = [*self.initial]
-            self.has_actions = has_actions(self.model, self.initial[self.names[0]])
+            self.has_actions = has_actions(self.model, next(iter(self.initial.values())))
             self._tables = [table.copy() for table in self.initial.values()]
             self._returns = np.zeros(self.model.n_envs)
             self._episodes = np.zeros(self.model.n_envs, dtype=np.int64)

@@ -97,7 +97,7 @@ PART_DURING_TRAINING = 1 / 2
 STAGES = (5, 10, 20)
 STAGES_AT_THE_END = (10, 25, 50, 100)
 LEAST_SURE = 10
-# Relative to the mean return.
+# Of the standard error, relative to the mean return.
 PRECISION = 0.05
 PRECISION_AT_THE_END = 0.01
 
@@ -160,7 +160,9 @@ class SampledEvaluator:
         found = play(stages[0], seed)
         for n_episodes in stages[1:]:
             n_more = n_episodes - len(found.returns)
-            if is_sure(found, within) or found.lengths.sum() + n_more * found.mean_length > most:
+            error = found.std_return / math.sqrt(max(len(found.returns) - 1, 1))
+            is_sure = error <= within * abs(found.mean_return) and len(found.returns) >= LEAST_SURE
+            if is_sure or found.lengths.sum() + n_more * found.mean_length > most:
                 break
             # Without a new seed, the environments continue with other episodes.
             found = found.joined(play(n_more, None))
@@ -182,13 +184,6 @@ class SampledEvaluator:
         from rl_yardstick.agents.compiled.engine import compiled_copy
 
         return compiled_copy(self.env)
-
-
-def is_sure(evaluation: Evaluation, precision: float) -> bool:
-    """Whether at least ten episodes have a small standard error relative to their mean."""
-    n_episodes = len(evaluation.returns)
-    error = float(np.std(evaluation.returns)) / math.sqrt(max(n_episodes - 1, 1))
-    return n_episodes >= LEAST_SURE and error <= precision * abs(evaluation.mean_return)
 
 
 def evaluate_compiled(
