@@ -115,10 +115,8 @@ def _decoded(value: Any) -> Any:
     """An attribute in JSON; its pickle, if it has one, which JSON holds as base64."""
     if not (isinstance(value, dict) and _SERIALIZED in value):
         return value
-    try:
+    with files.refused_as("holds a damaged pickle"):
         return base64.b64decode(value[_SERIALIZED], validate=True)
-    except (TypeError, ValueError) as error:
-        raise UnsafeFileError(f"holds a damaged pickle: {error}") from error
 
 
 def _check_variables(tensors: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> None:
