@@ -157,8 +157,8 @@ def play(console: Console, found: Model, args: argparse.Namespace) -> None:
     given: Any = {"before_step": show.before_step, "after_step": show.after_step}
     given |= {"deterministic": not args.stochastic}
     with show.live if mode == "ansi" else console.status("playing"):
-        for episode in play_episodes(agent, env, n_episodes, n_steps, **given):
-            show.after_episode(*episode)
+        for total, length, _ in play_episodes(agent, env, n_episodes, n_steps, **given):
+            show.after_episode(total, length)
     env.close()
     if args.record is not None:
         with console.status("writing the film"):

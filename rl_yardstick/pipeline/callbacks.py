@@ -178,7 +178,6 @@ class ProgressCallback(BlockCallback):
         text, is_live = TextColumn("{task.description}"), console.is_terminal and not console.quiet
         self.bar = Progress(*columns, text, console=console, transient=True, disable=not is_live)
         self.task = self.bar.add_task("", total=1.0)
-        self.told_at = time.monotonic()
 
     def start_clock(self, time_compiling: Callable[[], WorkTime]) -> None:
         """Begin to count the time."""
@@ -306,7 +305,7 @@ class EvaluationCallback(EvalCallback):
         before = self.episodes_seen
         self.episodes_seen += int(np.sum(self.locals["dones"]))
         is_due = self.eval_freq > 0 and self.n_calls % self.eval_freq == 0
-        if every := max(self.eval_episode_freq, 0):
+        if every := self.eval_episode_freq:
             is_due |= self.episodes_seen // every > before // every
         if is_due and isinstance(self.evaluator, SampledEvaluator):
             is_due = self.evaluator.can_afford(self.model, self.episodes_seen)
@@ -318,10 +317,7 @@ class EvaluationCallback(EvalCallback):
     def evaluate(self) -> bool:
         """Evaluate the current agent; False if a callback asks to stop the training."""
         check_model(self.model)
-        self.take_statistics()
-        begun = WorkTime.now()
-        found: Evaluation = self.evaluator(self.model)
-        self.taken += WorkTime.now() - begun
+        found = self.timed(self.evaluator)
         self.last_mean_reward = found.mean_return
         self.evaluations_timesteps.append(self.num_timesteps)
         self.evaluations_results.append(found.returns.tolist())
@@ -350,10 +346,14 @@ class EvaluationCallback(EvalCallback):
             save_agent(self.model, self.run.best_model_path)
         return self._on_event() if self.callback is not None else True
 
-    def take_statistics(self) -> None:
-        """Copy training's current normalisation statistics to evaluation."""
+    def timed(self, evaluator: Callable[[BaseAlgorithm], Evaluation]) -> Evaluation:
+        """Evaluate the agent with training's current normalisation statistics; its time counts."""
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
+        begun = WorkTime.now()
+        found = evaluator(self.model)
+        self.taken += WorkTime.now() - begun
+        return found
 
     def write(self) -> None:
         """Write ``evaluations.npz``."""

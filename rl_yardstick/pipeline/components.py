@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
 import gymnasium as gym
@@ -366,10 +367,8 @@ def read_signature(name: str) -> dict[str, list[str]]:
     """Import the class of an agent, or of a key of `WRAPPERS`, and read its signature."""
     from rl_yardstick.agents import load_algorithm
 
-    module, _, cls = WRAPPERS.get(name, "").partition(":")
-    found = constructor_parameters(
-        getattr(importlib.import_module(module), cls) if module else load_algorithm(name)
-    )
+    cls = resolve_name(WRAPPERS[name]) if name in WRAPPERS else load_algorithm(name)
+    found = constructor_parameters(cls)
     kinds = {name: sorted(_kinds(p.annotation, p.default)) for name, p in found.items()}
     return {name: kinds[name] for name in kinds if name not in {*SET_ELSEWHERE, *_INTERNAL}}
 

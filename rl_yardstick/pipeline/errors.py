@@ -10,13 +10,10 @@ from contextlib import contextmanager
 
 _SHORT_LIST = 12
 # Other names of hyperparameters, too different in spelling to be found by similarity.
-_SYNONYMS = {
-    "learning_rate": "lr alpha step_size",
-    "exploration_final_eps exploration_initial_eps": "epsilon eps",
-    "gamma": "discount discount_factor",
-}
-OTHER_NAMES = {
-    other: names.split() for names, others in _SYNONYMS.items() for other in others.split()
+OTHER_NAMES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("lr", "alpha", "step_size"), ("learning_rate",)),
+    **dict.fromkeys(("epsilon", "eps"), ("exploration_final_eps", "exploration_initial_eps")),
+    **dict.fromkeys(("discount", "discount_factor"), ("gamma",)),
 }
 
 _brief = reprlib.Repr()

@@ -25,7 +25,7 @@ from rl_yardstick.pipeline.files import read_bytes
 from rl_yardstick.pipeline.run import RECORD, Run, numbered_runs, statistics_beside
 from rl_yardstick.pipeline.settings import check_agent, read_entry, read_saved, special_settings
 from rl_yardstick.pipeline.spec import TrainSpec, validated
-from rl_yardstick.safe_files.files import first_look
+from rl_yardstick.safe_files.files import read_model
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -167,7 +167,7 @@ def zip_data(path: Path) -> dict[str, Any]:
     """The JSON in an agent's zip; pickles in it stay text."""
     content = read_bytes(path, MAX_MODEL)
     try:
-        return first_look(content)
+        return read_model(content)[1]
     except ValueError as error:
         raise UserError(f"{path} is no agent's zip: it {one_line(error)}") from error
 
@@ -294,13 +294,14 @@ def _own_classes(algorithm: type[BaseAlgorithm], typed: list[str]) -> Mapping[st
     from stable_baselines3.common.buffers import BaseBuffer
     from torch import nn, optim
 
+    from rl_yardstick.safe_files.known_objects import by_name
+
     kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     homes = tuple(f"{home}." for home in (*map(module_name, typed), algorithm.__module__))
     modules = [one for name, one in list(sys.modules.items()) if f"{name}.".startswith(homes)]
     values = [value for module in modules for value in list(vars(module).values())]
     classes = [one for one in values if isinstance(one, type) and issubclass(one, kinds)]
-    named = {f"{one.__module__}.{one.__qualname__}": one for one in classes}
-    return {name: one for name, one in named.items() if name.startswith(homes)}
+    return {name: one for name, one in by_name(classes).items() if name.startswith(homes)}
 
 
 # --- statistics, and training further -------------------------------------------------------------

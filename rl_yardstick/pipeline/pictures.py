@@ -174,11 +174,8 @@ def shade(colour: Colour) -> tuple[float, float, float]:
 
 BLACK = shade(INK)
 # A value below the scale.
-BELOW: Any = {
-    "facecolor": shade((222, 222, 222)),
-    "edgecolor": shade((196, 196, 196)),
-    "hatch": "////",
-}
+GREYS = {"facecolor": shade((222, 222, 222)), "edgecolor": shade((196, 196, 196))}
+BELOW: Any = {**GREYS, "hatch": "////"}
 GROUND = {WALL: SHELF, GOAL: PALE_GREEN, TRAP: PALE_RED}
 # Marker, its size as a share of the cell, and its colour.
 MARKS = {GOAL: ("*", 0.55, GREEN), TRAP: ("X", 0.36, INK), PRIZE: ("D", 0.15, AMBER)}

@@ -71,21 +71,32 @@ def play_episodes(
     n_steps: int | None = None,
     *,
     deterministic: bool = True,
+    when: str = "",
     before_step: Callable[[Any, Any], object] = lambda obs, actions: None,
     after_step: Callable[[bool], object] = lambda done: None,
-) -> Iterator[tuple[float, int]]:
+) -> Iterator[tuple[float, int, bool | None]]:
     """Play a number of episodes, or a number of steps over all environments.
 
     ``before_step`` gets the observations and the actions; ``after_step`` gets whether the step
-    ended an episode of the first environment.
+    ended an episode of the first environment; ``when`` stands in errors.
 
     Yields:
-        Return and length of each episode as it ends.
+        Return and length of each episode as it ends, and its success, None if it is not reported.
+
+    Raises:
+        UserError: if numbers are not finite, or the agent takes masks, and there are none.
     """
-    from rl_yardstick.pipeline.evaluation.sampled import Player
+    from rl_yardstick.agents.common.masks import check_masks_exist, present_masks
+    from rl_yardstick.agents.policies import takes_masks
     from rl_yardstick.pipeline.finite_numbers import check_numbers
 
-    choose = Player(model, env, "while it is played").predict
+    told: dict[str, Any] = {"deterministic": deterministic}
+    if is_masked := takes_masks(model):
+        try:
+            check_masks_exist(env)
+        except ValueError as error:
+            needs = f"{type(model).__name__} needs action masks, and the environment has none"
+            raise UserError(needs) from error
     obs: Any = env.reset()
     state = None
     starts = np.ones(env.num_envs, dtype=bool)
@@ -96,7 +107,10 @@ def play_episodes(
         due = (n_episodes + np.arange(env.num_envs)) // env.num_envs
     steps = 0
     while any(due > 0) and (n_steps is None or steps < n_steps):
-        actions, state = choose(obs, state=state, episode_start=starts, deterministic=deterministic)
+        check_numbers(obs, "observation", when or "while it is played", in_rows=True)
+        if is_masked:
+            told["action_masks"] = present_masks(env, obs)
+        actions, state = model.predict(obs, state=state, episode_start=starts, **told)
         before_step(obs, actions)
         obs, _, starts, infos = env.step(actions)
         steps += env.num_envs
@@ -106,8 +120,9 @@ def play_episodes(
             episode = infos[index].get("episode")
             if episode is not None:
                 due[index] -= 1
-                check_numbers(episode["r"], "return", f"of an episode of environment {index}")
-                yield episode["r"], episode["l"]
+                where = when or f"of an episode of environment {index}"
+                check_numbers(episode["r"], "return", where)
+                yield episode["r"], episode["l"], infos[index].get("is_success")
 
 
 class FrameTaker:

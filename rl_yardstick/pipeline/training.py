@@ -22,7 +22,6 @@ from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.envs import found_models
 from rl_yardstick.envs.finite_spaces import describe
-from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.machine_code.compiling import compile_timer
 from rl_yardstick.pipeline import callbacks
 from rl_yardstick.pipeline.components import action_noise, build, constructor_arguments
@@ -134,8 +133,7 @@ class Training:
             maps = ValueMapRecorder(run.path / "value_maps.npz", exact)
         self.evaluation = callbacks.EvaluationCallback(run, judge, frequencies, maps, critics)
         recorder = watch_of(spec, agent, maps)
-        # What a page plays of the training.
-        self.watch: Watch | None = recorder or (maps if spec.watch_learning else None)
+        self.watch: Watch | None = recorder or maps  # what a page plays of the training
         self.pulls = callbacks.PullRecorder(run.path) if is_bandit else None
         if is_bandit and getattr(agent, "engine", None) == "compiled":  # it stops at no pull
             self.pulls, note = None, "engine: compiled keeps no pulls, so regret is not known"
@@ -207,17 +205,12 @@ class Training:
             if not evaluation.evaluations_timesteps:  # the run was shorter than their interval
                 evaluation.init_callback(agent)
                 evaluation.evaluate()
-            evaluation.write()
             if evaluation.value_maps is not None:
                 evaluation.value_maps.finish(agent)
-                self.watch = self.watch or evaluation.value_maps
             if evaluation.critics is not None:
                 evaluation.critics.finish(agent.num_timesteps)
-            evaluation.take_statistics()
-            begun, evaluator = WorkTime.now(), evaluation.evaluator
-            self.final = evaluator.at_the_end(agent)
-            evaluation.taken += WorkTime.now() - begun
-            self.evaluation_steps = getattr(evaluator, "n_steps", 0)
+            self.final = evaluation.timed(evaluation.evaluator.at_the_end)
+            self.evaluation_steps = getattr(evaluation.evaluator, "n_steps", 0)
         self.engine = getattr(agent, "engine_in_use", None)
         if self.pulls is not None and self.pulls.n_calls > 0:
             self.pulled = self.pulls.summary()

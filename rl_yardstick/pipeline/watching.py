@@ -63,19 +63,12 @@ class TableRecorder(BlockCallback):
     def __init__(self, n_episodes: int = 0) -> None:
         super().__init__()
         self.n_episodes = n_episodes
-        self.names: list[str] = []  # of the tables
-        self.has_actions = False  # whether the first table has a number for each state and action
-        self.initial: dict[str, Floats] = {}  # the tables before the first step
         self.steps: list[NDArray[np.void]] = []  # one array of `STEP` and of `MOVE` for each step
         self.moves: list[NDArray[np.void]] = []
         self.changes: list[NDArray[np.void]] = []  # of `CHANGE`
         self.n_changes = 0
         self.is_full = False
         self.is_cut = False  # whether these episodes have more steps than recorded
-        self._tables: list[Floats] = []  # after the previous step
-        self._obs: Any = None
-        self._returns = np.zeros(0)
-        self._episodes = np.zeros(0, dtype=np.int64)
 
     def rows(self) -> dict[str, NDArray[np.void]]:
         """All records of steps, moves and changes."""
@@ -89,16 +82,17 @@ class TableRecorder(BlockCallback):
         """After each step, as long as steps are recorded."""
         return Horizon() if self.is_full else Horizon(calls=1)
 
+    def _on_training_start(self) -> None:
+        self.initial = {name: table.copy() for name, table in tables_of(self.model).items()}
+        # Whether the first table has a number for each state and action.
+        self.has_actions = has_actions(self.model, next(iter(self.initial.values())))
+        self._tables = [table.copy() for table in self.initial.values()]  # after the last step
+        self._returns = np.zeros(self.model.n_envs)
+        self._episodes = np.zeros(self.model.n_envs, dtype=np.int64)
+
     def _on_rollout_start(self) -> None:
         if self.is_full:
             return
-        if not self.initial:
-            self.initial = {name: table.copy() for name, table in tables_of(self.model).items()}
-            self.names = [*self.initial]
-            self.has_actions = has_actions(self.model, self.initial[self.names[0]])
-            self._tables = [table.copy() for table in self.initial.values()]
-            self._returns = np.zeros(self.model.n_envs)
-            self._episodes = np.zeros(self.model.n_envs, dtype=np.int64)
         self._obs = np.array(self.model._last_obs)
         told = getattr(self.model, "last_steps", None)
         if told is not None:  # cleared, so that the next step cannot read an old number
@@ -189,8 +183,7 @@ def watch_of(
                 f"{spec.algo} on {spec.env_id} have {n_entries:,}"
             )
         return TableRecorder(spec.watch_episodes)
-    is_small = maps is not None and maps.evaluator.model.n_states <= value_maps.MAX_STATES
-    if maps is None or not is_small or value_maps.best_actions_of(maps.evaluator, agent) is None:
+    if maps is None or value_maps.best_actions_of(maps.evaluator, agent) is None:
         raise UserError(
             f"--watch-learning shows tables, or an agent's actions in up to 2,500 known states: "
             f"{spec.algo} on {spec.env_id} has neither"

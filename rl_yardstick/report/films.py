@@ -110,7 +110,7 @@ def _filmed(
     taker, frames = FrameTaker(env), list[Any]()
     kept: Any = {"after_step": lambda done: frames.extend(taker.take(done))}
     played = play_episodes(agent, env, 1, max_steps, deterministic=deterministic, **kept)
-    return frames, next(played, None)
+    return frames, next(((total, length) for total, length, _ in played), None)
 
 
 def _shrunk(frames: list[Any]) -> list[Any]:

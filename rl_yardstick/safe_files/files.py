@@ -6,7 +6,8 @@ import io
 import json
 import stat
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,17 @@ class UnsafeFileError(ValueError):
         line = " ".join(message.split())
         super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in line))
         self.key = key
+
+
+@contextmanager
+def refused_as(what: str) -> Iterator[None]:
+    """Any error in the block becomes an `UnsafeFileError`: ``what``, and its message."""
+    try:
+        yield
+    except UnsafeFileError:
+        raise
+    except Exception as error:  # damaged files can fail anywhere
+        raise UnsafeFileError(f"{what}: {str(error) or type(error).__name__}") from error
 
 
 def shown(value: object) -> str:
@@ -96,48 +108,36 @@ def read_members(content: bytes, budget: Budget | None = None) -> dict[str, byte
     budget = budget or Budget(len(content))
     budget.charge(content.count(_ENTRY) * _BYTES_PER_ENTRY)
     members = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            infos = archive.infolist()
-            if any(info.compress_type not in _COPIES for info in infos):
-                raise UnsafeFileError("has a compression method that is not read here")
-            budget.charge(sum(info.file_size * _COPIES[info.compress_type] for info in infos))
-            for info in infos:
-                with archive.open(info) as member:  # may hold more than it declares
-                    members[info.filename] = member.read(info.file_size)
-                if len(members[info.filename]) != info.file_size:
-                    raise UnsafeFileError(f"{shown(info.filename)} is cut off")
-    except UnsafeFileError:
-        raise
-    except Exception as error:  # damaged, encrypted, or of an unknown kind
-        raise UnsafeFileError(f"is no whole zip: {error}") from error
+    with refused_as("is no whole zip"), zipfile.ZipFile(io.BytesIO(content)) as archive:
+        infos = archive.infolist()
+        if any(info.compress_type not in _COPIES for info in infos):
+            raise UnsafeFileError("has a compression method that is not read here")
+        budget.charge(sum(info.file_size * _COPIES[info.compress_type] for info in infos))
+        for info in infos:
+            with archive.open(info) as member:  # may hold more than it declares
+                members[info.filename] = member.read(info.file_size)
+            if len(members[info.filename]) != info.file_size:
+                raise UnsafeFileError(f"{shown(info.filename)} is cut off")
     return members
 
 
-def read_model_members(content: bytes, budget: Budget) -> dict[str, bytes]:
-    """Read the members of a model's zip; refuses others than models have."""
+def read_model(content: bytes) -> tuple[dict[str, bytes], dict[str, Any], Budget]:
+    """Read a model's zip, without the libraries; refuses members that no model has.
+
+    Returns:
+        the members by name, the settings among them, in which pickles stay text, and the budget
+        that is left.
+    """
+    budget = Budget(len(content))
     members = read_members(content, budget)
     for name in members:
         if name not in _TEXTS and not name.endswith(TENSORS):
             raise UnsafeFileError(f"holds {shown(name)}, which no model file has")
     if SETTINGS not in members or not any(name.endswith(TENSORS) for name in members):
         raise UnsafeFileError("lacks parts that a model has")
-    return members
-
-
-def first_look(content: bytes) -> dict[str, Any]:
-    """Read the settings in a model's zip, without the libraries; pickled settings stay text."""
-    budget = Budget(len(content))
-    return parse_settings(read_model_members(content, budget), budget)
-
-
-def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, Any]:
-    """Parse the settings of a model, which are JSON."""
     budget.charge_json(members[SETTINGS])
-    try:
+    with refused_as("has settings that are no JSON"):
         data = json.loads(members[SETTINGS].decode())
-    except (ValueError, RecursionError) as error:
-        raise UnsafeFileError(f"has settings that are no JSON: {error}") from error
     if not isinstance(data, dict):
         raise UnsafeFileError("has settings that do not map names to values")
-    return data
+    return members, data, budget

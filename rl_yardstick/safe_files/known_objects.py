@@ -61,13 +61,6 @@ def _generator(made: Made, build: Build) -> np.random.Generator:
     return generator
 
 
-_OF_NUMPY: Mapping[str, Maker] = {
-    **ARRAYS,
-    "numpy.random._pickle.__generator_ctor": _generator,
-    # The legacy generator of Gym's spaces: Gymnasium's make a new one.
-    "numpy.random._pickle.__randomstate_ctor": lambda made, build: None,
-    "gym.utils.seeding.RandomNumberGenerator._generator_ctor": lambda made, build: None,
-}
 _CLASSES_OF_NUMPY: Mapping[str, type] = {
     f"numpy.{kind.__name__}": kind
     for kind in (np.ndarray, np.float32, np.float64, np.int64, np.int32, np.int8, np.uint8)
@@ -142,15 +135,6 @@ def _flat(pid: Any, content: bytes) -> th.Tensor:
     return tensor
 
 
-def _lone_storage(made: Made, build: Build) -> th.Tensor:
-    """A storage in the legacy format, which PyTorch uses for tensors in other pickles."""
-    file = io.BytesIO(*made.args)
-    reader = pickles.Reader(file, build.budget)
-    # Three headers precede the storage; a list of keys and the size follow it.
-    storage = [reader.load() for _ in range(5)][3]
-    return _flat(storage.args[0], file.read()[8:])
-
-
 def _tensor(made: Made, build: Build) -> th.Tensor:
     storage, offset, shape, strides, requires_grad = build(made.args[:5])
     if math.prod(shape) > len(storage):
@@ -166,7 +150,8 @@ _OF_TENSORS: Mapping[str, Maker] = {
     ),
     "torch._utils._rebuild_tensor_v2": _tensor,
     "torch._utils._rebuild_parameter": lambda made, build: build(made.args[0]),
-    "torch.storage._load_from_bytes": _lone_storage,
+    # A lone storage in a stream, as PyTorch writes those of tensors in other pickles.
+    "torch.storage._load_from_bytes": lambda made, build: load_tensors(made.args[0], build.budget),
 }
 
 
@@ -208,7 +193,11 @@ def _noise(cls: Any, made: Made, build: Build) -> Any:
 
 _MAKERS: Mapping[str, Maker] = {
     **_OF_TENSORS,
-    **_OF_NUMPY,
+    **ARRAYS,
+    "numpy.random._pickle.__generator_ctor": _generator,
+    # The legacy generator of Gym's spaces: Gymnasium's make a new one.
+    "numpy.random._pickle.__randomstate_ctor": lambda made, build: None,
+    "gym.utils.seeding.RandomNumberGenerator._generator_ctor": lambda made, build: None,
     **{name: partial(filled, cls) for name, cls in by_name(_FILLED).items()},
     **{name: partial(_noise, cls) for name, cls in by_name(_NOISES).items()},
     **{name: lambda made, build: _CALLED[made.name](*build(made.args)) for name in _CALLED},

@@ -66,10 +66,7 @@ def load_model(
         UnsafeFileError: if the file has forbidden contents, is damaged, or is too large.
         ValueError: if the model does not fit ``env``; the message is the library's.
     """
-    content = files.content_of(path, files.MAX_ARCHIVE_BYTES)
-    budget = Budget(len(content))
-    members = files.read_model_members(content, budget)
-    raw = files.parse_settings(members, budget)
+    members, raw, budget = files.read_model(files.content_of(path, files.MAX_ARCHIVE_BYTES))
     settings = {key: _decoded(value) for key, value in raw.items() if key not in _NOT_READ}
     for key in settings:
         if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
@@ -118,10 +115,8 @@ def _decoded(value: Any) -> Any:
     """An attribute in JSON; its pickle, if it has one, which JSON holds as base64."""
     if not (isinstance(value, dict) and _SERIALIZED in value):
         return value
-    try:
+    with files.refused_as("holds a damaged pickle"):
         return base64.b64decode(value[_SERIALIZED], validate=True)
-    except (TypeError, ValueError) as error:
-        raise UnsafeFileError(f"holds a damaged pickle: {error}") from error
 
 
 def _check_variables(tensors: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> None:
@@ -187,12 +182,10 @@ def inspect_model(path: Path | str) -> dict[str, dict[str, str]]:
         for each of ``"members"``, ``"weights"``, ``"settings"`` and ``"suspicious"``, texts of one
         line by name.
     """
-    content = files.content_of(path, files.MAX_ARCHIVE_BYTES)
-    budget = Budget(len(content))
-    members = files.read_model_members(content, budget)
-    found: dict[str, dict[str, str]] = {"members": {}, "weights": {}, "settings": {}}
-    found["suspicious"] = {}
-    for key, value in files.parse_settings(members, budget).items():
+    members, settings, budget = files.read_model(files.content_of(path, files.MAX_ARCHIVE_BYTES))
+    kinds = "members", "weights", "settings", "suspicious"
+    found: dict[str, dict[str, str]] = {kind: {} for kind in kinds}
+    for key, value in settings.items():
         name = shown(key)[1:-1]
         try:
             found["settings"][name] = _setting(key, value, budget)

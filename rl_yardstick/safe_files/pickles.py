@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
 
-from rl_yardstick.safe_files.files import Budget, UnsafeFileError, shown
+from rl_yardstick.safe_files.files import Budget, UnsafeFileError, refused_as, shown
 
 # The instructions of protocols 0 to 5, without frozen sets, extension codes, out-of-band buffers,
 # Python 2's texts, and keyword arguments.
@@ -82,7 +82,7 @@ class Reader(pickle._Unpickler):
     def load(self) -> Any:
         """Read the next pickle of the file as lists, tuples, names, records, and plain data."""
         start = self.file.tell()
-        try:
+        with refused_as("is no whole pickle"):
             for instruction, argument, _ in pickletools.genops(self.file):
                 if instruction.name not in INSTRUCTIONS:
                     raise UnsafeFileError(f"a pickle with the instruction {instruction.name}")
@@ -93,11 +93,6 @@ class Reader(pickle._Unpickler):
                 self.budget.charge(_PRICE + factor * length)
             self.file.seek(start)
             return super().load()
-        except UnsafeFileError:
-            raise
-        except Exception as error:  # a damaged pickle can fail at any instruction
-            reason = str(error) or type(error).__name__
-            raise UnsafeFileError(f"is no whole pickle: {reason}") from error
 
     def find_class(self, module: str, name: str) -> Name:
         """Record a name where Python would import a class, as it is in current libraries."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.safe_files import files
 from rl_yardstick.safe_files.arrays import ARRAYS
-from rl_yardstick.safe_files.files import Budget, Source, UnsafeFileError
+from rl_yardstick.safe_files.files import Budget, Source, UnsafeFileError, refused_as
 from rl_yardstick.safe_files.pickles import DICTIONARY, END_OF_KEYS, Build, Made, Reader
 
 # A dictionary of small keys takes many times its pickle: more than a model may, up to a limit.
@@ -47,7 +47,7 @@ def read_table_file(source: Source) -> Any:
     suffix = Path(source).suffix.lower() if isinstance(source, str | Path) else ""
     if not content.strip():
         raise UnsafeFileError("is empty")
-    try:
+    with refused_as("cannot be read"):
         if content.startswith(b"\x93NUMPY"):
             return _array_file(content, budget)
         if content.startswith(b"PK\3\4"):
@@ -60,10 +60,6 @@ def read_table_file(source: Source) -> Any:
         if not content.rstrip().endswith(b"."):
             raise UnsafeFileError("is cut off, or no .npy, .npz, .json, .csv, pickle or newer .pt")
         return read_pickled_table(content, budget)
-    except UnsafeFileError:
-        raise
-    except Exception as error:  # a damaged file can fail anywhere
-        raise UnsafeFileError(f"cannot be read: {str(error) or type(error).__name__}") from error
 
 
 # Of any module, since nothing is called; a defaultdict's maker of missing values is not built.

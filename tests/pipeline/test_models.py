@@ -225,7 +225,7 @@ def returns_of(request, n_episodes, n_envs=1):
     env = playing_env(chosen, None, n_envs)
     model = load_agent(chosen, env)
     env.seed(0)
-    played = list(play_episodes(model, env, n_episodes))
+    played = [episode[:2] for episode in play_episodes(model, env, n_episodes)]
     env.close()
     return played
 
@@ -270,7 +270,7 @@ def test_it_plays_as_the_library_evaluates_it(zoo, tmp_path):
 def test_returns_of_rewards_as_training_normalised_them(zoo):
     chosen = find_model(Wanted(algo="a2c", env_id=CART, log_folder=zoo))
     env = playing_env(chosen, None, norm_reward=True)
-    ((total, length),) = play_episodes(load_agent(chosen, env), env, 1)
+    ((total, length, _),) = play_episodes(load_agent(chosen, env), env, 1)
     # Every reward of CartPole is 1, and the statistics stay as training left them.
     one = float(unwrap_vec_normalize(env).normalize_reward(np.ones(1))[0])
     assert total == pytest.approx(length * one, rel=1e-5) != length

@@ -56,7 +56,7 @@ def test_targets_are_those_of_the_rule_to_the_last_bit(engine):
 @pytest.mark.parametrize("name", ["double_qlearning", "dyna_q"])
 def test_tables_with_a_number_for_each_action_come_first(name):
     _, recorder = watched(LAKE, name, engine="interpreted")
-    assert recorder.names[0] == "q_tables"
+    assert next(iter(recorder.initial)) == "q_tables"
     assert recorder.has_actions
 
 

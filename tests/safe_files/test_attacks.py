@@ -23,7 +23,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.utils import ConstantSchedule
 
 from rl_yardstick.safe_files.buffers_and_statistics import load_replay_buffer, read_normalization
-from rl_yardstick.safe_files.files import UnsafeFileError, first_look
+from rl_yardstick.safe_files.files import UnsafeFileError, read_model
 from rl_yardstick.safe_files.known_objects import load_tensors, read_pickle
 from rl_yardstick.safe_files.models import inspect_model, load_model
 from rl_yardstick.safe_files.pickles import INSTRUCTIONS
@@ -262,7 +262,7 @@ def test_a_model_has_settings_and_tensors(genuine):
     for missing in ("data", "pth"):
         members = {name: held for name, held in genuine.items() if not name.endswith(missing)}
         with pytest.raises(UnsafeFileError, match="lacks parts that a model has"):
-            first_look(zip_of(members))
+            read_model(zip_of(members))
 
 
 BIAS = "action_net.bias"
@@ -452,7 +452,7 @@ def test_memory_is_in_proportion_to_a_models_file(genuine, tmp_path):
         path = tmp_path / "model.zip"
         path.write_bytes(content)
         assert check_peak(attack, content, partial(load_model, PPO)), attack
-        check_peak(attack, content, lambda stream: first_look(stream.read()))
+        check_peak(attack, content, lambda stream: read_model(stream.read()))
         check_peak(attack, content, lambda stream: inspect_model(path))  # noqa: B023
 
 

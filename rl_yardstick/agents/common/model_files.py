@@ -39,11 +39,9 @@ from rl_yardstick.agents.common.given_spaces import Translation, translation
 from rl_yardstick.agents.common.schedules import ExponentialSchedule
 from rl_yardstick.safe_files.files import (
     MAX_ARCHIVE_BYTES,
-    Budget,
     UnsafeFileError,
     content_of,
-    parse_settings,
-    read_model_members,
+    read_model,
     shown,
 )
 from rl_yardstick.safe_files.known_objects import check_values, load_tensors
@@ -312,10 +310,8 @@ class JsonAlgorithm(BaseAlgorithm):
         if not isinstance(path, io.BufferedIOBase):
             path = Path(path)
             path = path if path.exists() else path.with_name(f"{path.name}.zip")
-        content = content_of(path, MAX_ARCHIVE_BYTES)
-        budget = Budget(len(content))
-        members = read_model_members(content, budget)
-        data = {**cls._read_data(members, budget, path, custom_objects), **kwargs}
+        members, raw, budget = read_model(content_of(path, MAX_ARCHIVE_BYTES))
+        data = {**cls._read_data(raw, path, custom_objects), **kwargs}
         given = env
         if env is not None:
             env = cls._wrap_env(env, data["verbose"])
@@ -350,18 +346,13 @@ class JsonAlgorithm(BaseAlgorithm):
 
     @classmethod
     def _read_data(
-        cls,
-        members: Mapping[str, bytes],
-        budget: Budget,
-        path: Any,
-        replaced: dict[str, Any] | None,
+        cls, raw: dict[str, Any], path: Any, replaced: dict[str, Any] | None
     ) -> dict[str, Any]:
         """The decoded attributes of a zip of this class, without the replaced ones."""
         if not (replaced is None or isinstance(replaced, dict)):
             raise ValueError("custom_objects must be a dictionary or None")
         known = replaced or {}
         named = "it" if isinstance(path, io.BufferedIOBase) else str(path)
-        raw = parse_settings(members, budget)
         if raw.pop("algorithm", None) != cls.__name__:
             raise ValueError(f"{named} does not hold a {cls.__name__} agent")
         if raw.pop("format", None) != FORMAT_VERSION:

@@ -15,70 +15,31 @@ from typing import Any
 import numpy as np
 from stable_baselines3 import A2C
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from rl_yardstick.agents.common.masks import check_masks_exist, present_masks
-from rl_yardstick.agents.policies import is_network, takes_masks
+from rl_yardstick.agents.policies import is_network
 from rl_yardstick.envs.brackets import may_have_bracket
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, Yardstick, bracket_of
 from rl_yardstick.pipeline.finite_numbers import check_numbers
+from rl_yardstick.pipeline.playing import play_episodes
 from rl_yardstick.pipeline.spec import TrainSpec
-
-
-class Player:
-    """An agent in environments: it is told action masks, and sees finite observations only.
-
-    Raises UserError if it takes masks, and the environments have none.
-    """
-
-    def __init__(self, model: BaseAlgorithm, env: VecEnv, when: str) -> None:
-        self.model, self.env, self.when = model, env, when
-        self.is_masked = takes_masks(model)
-        try:
-            if self.is_masked:
-                check_masks_exist(env)
-        except ValueError as error:
-            needs = f"{type(model).__name__} needs action masks, and the environment has none"
-            raise UserError(needs) from error
-
-    def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """Check the observation, then predict."""
-        check_numbers(observation, "observation", self.when, in_rows=True)
-        if self.is_masked:
-            kwargs["action_masks"] = present_masks(self.env, observation)
-        actions, state = self.model.predict(observation, **kwargs)
-        return actions, state
 
 
 def evaluate(
     model: BaseAlgorithm, env: VecEnv, n_episodes: int, seed: int | None, deterministic: bool = True
 ) -> Evaluation:
     """Play ``n_episodes``, determined by the seed; with None, environments are not reseeded."""
-    successes: list[bool] = []
-
-    def note_success(local: dict[str, Any], _: dict[str, Any]) -> None:
-        if local["done"] and "is_success" in local["info"]:
-            successes.append(bool(local["info"]["is_success"]))
-
     # Planners, for example, do not count steps.
     when = f"in the evaluation at step {getattr(model, 'num_timesteps', 0):,}"
     if seed is not None:
         env.seed(seed)
-    watched: Any = Player(model, env, when)
-    returns, lengths = evaluate_policy(
-        *(watched, env, n_episodes, deterministic),
-        return_episode_rewards=True,
-        callback=note_success,
-        warn=False,
-    )
-    check_numbers(returns, "return", when)
+    played = play_episodes(model, env, n_episodes, deterministic=deterministic, when=when)
+    returns, lengths, successes = zip(*played, strict=True)
     return Evaluation(
-        np.asarray(returns, dtype=np.float64),
-        np.asarray(lengths, dtype=np.int64),
-        np.array(successes) if len(successes) == n_episodes else None,
+        np.array(returns, dtype=np.float64),
+        np.array(lengths, dtype=np.int64),
+        None if None in successes else np.array(successes, dtype=np.bool_),
     )
 
 
@@ -136,7 +97,7 @@ PART_DURING_TRAINING = 1 / 2
 STAGES = (5, 10, 20)
 STAGES_AT_THE_END = (10, 25, 50, 100)
 LEAST_SURE = 10
-# Relative to the mean return.
+# Of the standard error, relative to the mean return.
 PRECISION = 0.05
 PRECISION_AT_THE_END = 0.01
 
@@ -199,7 +160,9 @@ class SampledEvaluator:
         found = play(stages[0], seed)
         for n_episodes in stages[1:]:
             n_more = n_episodes - len(found.returns)
-            if is_sure(found, within) or found.lengths.sum() + n_more * found.mean_length > most:
+            error = found.std_return / math.sqrt(max(len(found.returns) - 1, 1))
+            is_sure = error <= within * abs(found.mean_return) and len(found.returns) >= LEAST_SURE
+            if is_sure or found.lengths.sum() + n_more * found.mean_length > most:
                 break
             # Without a new seed, the environments continue with other episodes.
             found = found.joined(play(n_more, None))
@@ -223,23 +186,16 @@ class SampledEvaluator:
         return compiled_copy(self.env)
 
 
-def is_sure(evaluation: Evaluation, precision: float) -> bool:
-    """Whether at least ten episodes have a small standard error relative to their mean."""
-    n_episodes = len(evaluation.returns)
-    error = float(np.std(evaluation.returns)) / math.sqrt(max(n_episodes - 1, 1))
-    return n_episodes >= LEAST_SURE and error <= precision * abs(evaluation.mean_return)
-
-
 def evaluate_compiled(
     model: BaseAlgorithm, copy: Any, n_episodes: int, seed: int | None
 ) -> Evaluation:
     """Like `evaluate`, in compiled code; the library's network decides near ties."""
-    from rl_yardstick.agents.compiled.engine import play_episodes
+    from rl_yardstick.agents.compiled import engine
     from rl_yardstick.agents.networks.perceptron import one_thread
 
     if seed is not None:
         copy[0].seed(seed)
     with one_thread() if is_network(model) else nullcontext():
-        found = play_episodes(model, copy, n_episodes)
+        found = engine.play_episodes(model, copy, n_episodes)
     check_numbers(found.returns, "return", f"in the evaluation at step {model.num_timesteps:,}")
     return Evaluation(found.returns.copy(), found.lengths, None)

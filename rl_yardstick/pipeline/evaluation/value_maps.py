@@ -49,10 +49,7 @@ class ValueMap:
 def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | None:
     """The map of an agent with one action per state, on a grid of up to 2500 states; else None."""
     model, layout = evaluator.model, evaluator.layout
-    if layout is None or model.n_states > MAX_STATES:
-        return None
-    policy = best_actions_of(evaluator, agent)
-    if policy is None:
+    if layout is None or (policy := best_actions_of(evaluator, agent)) is None:
         return None
     optimal_values, optimal_actions = evaluator.optimum
     return ValueMap(
@@ -69,7 +66,9 @@ def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | Non
 
 
 def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | None:
-    """Actions at each step and state, shape (1 or horizon, S); None if the policy is random."""
+    """Actions at each step and state, (1 or horizon, S); None if random, or on larger maps."""
+    if evaluator.model.n_states > MAX_STATES:
+        return None
     policy = evaluator.policy(agent, deterministic=True)
     if np.issubdtype(policy.dtype, np.integer):
         return np.atleast_2d(policy).astype(np.int64)
@@ -99,12 +98,10 @@ class ValueMapRecorder:
             self.moments = [moment for moment in self.moments if moment[0] % self.stride == 0]
 
     def _append(self, agent: BaseAlgorithm) -> None:
-        if self.evaluator.model.n_states > MAX_STATES:
+        policy, now = best_actions_of(self.evaluator, agent), agent.num_timesteps
+        if policy is None or (self.moments and self.moments[-1][1] == now):
             return
-        now, policy = (self.n_units, agent.num_timesteps), best_actions_of(self.evaluator, agent)
-        if policy is None or (self.moments and self.moments[-1][1] == agent.num_timesteps):
-            return
-        self.moments.append((*now, self.evaluator.values(policy), policy[0]))
+        self.moments.append((self.n_units, now, self.evaluator.values(policy), policy[0]))
 
     def finish(self, agent: BaseAlgorithm) -> None:
         """Record the map at the end of training, and write all maps."""

@@ -113,7 +113,7 @@ def place_data(spec: TrainSpec, recorder: Watch) -> dict[str, Any]:
         model, layout = recorder.evaluator.model, recorder.evaluator.layout
         n_states, n_actions = model.n_states, model.n_actions
     elif recorder.has_actions:
-        *_, n_states, n_actions = recorder.initial[recorder.names[0]].shape
+        *_, n_states, n_actions = next(iter(recorder.initial.values())).shape
     with closing(make_single_env(spec, training=True)) as env:
         layout = layout or _layout_of(env, n_states)
         names = action_names(env)
