@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -123,7 +122,7 @@ def nearest(trainings: Sequence[_Training], rule: str) -> tuple[Near, list[Near]
     """The right formula, and all, the nearest first: differences are averaged over seeds."""
     sums: dict[str, Floats] = {}
     for one in trainings:
-        uses = (one.steps.counts(one.values.shape[1] > 1) >= VISITS).astype(float)
+        uses = (one.steps.counts(one.values.size) >= VISITS).astype(float)
         uses[END] = 0.0
         for found in candidates(one.steps, rule, one.values, one.first):
             tolerance = 0.08 + 0.05 * np.abs(found.values) + 0.35 * found.spread
@@ -168,9 +167,7 @@ class _ByValues:
             return replace(found, state="unreadable", notes=(note,))
         return found
 
-    def _trainings(
-        self, n: int, n_seeds: int, changes: Mapping[str, Any] = MappingProxyType({})
-    ) -> list[_Training]:
+    def _trainings(self, n: int, n_seeds: int, /, **changes: Any) -> list[_Training]:
         found = []
         for seed in range(1, 1 + n_seeds):
             trained, begun = (self.subject.train(steps, seed, **changes) for steps in (n, 3))
@@ -225,14 +222,14 @@ class _ByValues:
         rates = {name: 1e-9 for name in self.subject.parameters if RATES.match(name)}
         length = self.subject.named(*ROLLOUTS)
         if rates and rule != "states":
-            [(q, _, d, _)] = self._trainings(self.length // 2, 1, rates)
+            [(q, _, d, _)] = self._trainings(self.length // 2, 1, **rates)
             is_clear = (d.weight > 0) & (np.ptp(q, axis=1)[d.state] > 0.3)
             share = float(np.mean((q[d.state, d.action] < q.max(axis=1)[d.state])[is_clear]))
             if share > 0.25:
                 told = f"{share:.0%} of its actions are not its best"
                 yield "exploration-inverted", f"with {' and '.join(rates)} at 0, {told}"
         if length:
-            [(q, _, d, _)] = short = self._trainings(self.length, 1, {length: 2})
+            [(q, _, d, _)] = short = self._trainings(self.length, 1, **{length: 2})
             found = measured(q, d, rule)
             if nearest(short, rule)[0].rms > 1 and any(found.off()):
                 yield "", f"with {length} at 2, {found.words()}"

@@ -149,12 +149,11 @@ class Candidate(NamedTuple):
 
 def solve(name: str, formula: Backup, d: Steps, rule: str, own: Floats) -> Candidate:
     """The fixed point of a formula on a log; cells that it never updates have ``own`` values."""
-    by_action, q = own.shape[1] > 1, np.zeros_like(own)
-    known = np.bincount(d.cells(by_action), d.weight, own.size).reshape(own.shape) > 0
-    spread = q
+    q = spread = np.zeros_like(own)
+    known = np.bincount(d.cells(own.size), d.weight, own.size).reshape(own.shape) > 0
     for _ in range(200):
         target = formula(d, next_values(q, d, rule))
-        before, (mean, spread) = q, d.means(target, by_action)
+        before, (mean, spread) = q, d.means(target, own.size)
         q = np.clip(np.where(known, mean, own), -60, 60)
         if np.abs(q - before).max() < 1e-4:
             break
@@ -247,12 +246,12 @@ def _with_resets(d: Steps) -> Steps:
 def _not_detached(right: Candidate, d: Steps, rule: str) -> Candidate:
     """Values of the least squared error, where the target moves with the values."""
     q, rows = right.values, np.arange(len(d.state))
-    by_action = q.shape[1] > 1
     for _ in range(6):
         best = q[d.shown].argmax(axis=1) if rule == "largest" else d.next_action
         slopes = np.zeros((len(rows), q.size))
-        slopes[rows, d.cells(by_action)] += 1
-        slopes[rows, d.shown * N_ACTIONS + best if by_action else d.shown] -= GAMMA * d.goes_on
+        slopes[rows, d.cells(q.size)] += 1
+        ahead = d.shown if q.shape[1] == 1 else d.shown * N_ACTIONS + best
+        slopes[rows, ahead] -= GAMMA * d.goes_on
         weighted = slopes * d.weight[:, None]
         normal = weighted.T @ slopes + 1e-8 * np.eye(q.size)
         q = np.linalg.solve(normal, weighted.T @ d.reward).reshape(q.shape)
@@ -318,8 +317,7 @@ def fitted(
 
 def measured(q: Floats, d: Steps, rule: str) -> Measured:
     """Read the backup off values, (S, 2) or (S, 1), in well-visited cells."""
-    by_action, ahead = q.shape[1] > 1, next_values(q, d, rule)(d.shown)
-    often = (d.counts(by_action) >= 40).ravel()
-    means = [d.means(part, by_action)[0].ravel()[often] for part in parts_of(d, ahead)]
-    told = q.ravel()[often]
+    often, ahead = d.counts(q.size) >= 40, next_values(q, d, rule)(d.shown)
+    means = [d.means(part, q.size)[0][often] for part in parts_of(d, ahead)]
+    told = q[often]
     return fitted(told, means, 1 / (0.1 + 0.05 * np.abs(told)))

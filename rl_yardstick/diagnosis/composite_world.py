@@ -141,23 +141,22 @@ class Steps:
             setattr(both, name, np.concatenate([each, getattr(other, name)]))
         return both
 
-    def cells(self, by_action: bool) -> Ints:
-        """The number of each step's cell: of the state, or of the state and action."""
-        cells: Ints = self.state * N_ACTIONS + self.action if by_action else self.state
+    def cells(self, size: int) -> Ints:
+        """The number of each step's cell, of ``size``: its state, or its state and action."""
+        cells: Ints = self.state if size == N_STATES else self.state * N_ACTIONS + self.action
         return cells
 
-    def means(self, target: Floats, by_action: bool) -> tuple[Floats, Floats]:
+    def means(self, target: Floats, size: int) -> tuple[Floats, Floats]:
         """The weighted mean and spread of a target in each cell, (S, 2) or (S, 1); 0 if empty."""
-        cells, n = self.cells(by_action), N_STATES * (N_ACTIONS if by_action else 1)
-        total = np.maximum(np.bincount(cells, self.weight, n), 1e-9)
-        mean = np.bincount(cells, self.weight * target, n) / total
-        variance = np.bincount(cells, self.weight * (target - mean[cells]) ** 2, n) / total
+        cells = self.cells(size)
+        total = np.maximum(np.bincount(cells, self.weight, size), 1e-9)
+        mean = np.bincount(cells, self.weight * target, size) / total
+        variance = np.bincount(cells, self.weight * (target - mean[cells]) ** 2, size) / total
         return mean.reshape(N_STATES, -1), np.sqrt(variance).reshape(N_STATES, -1)
 
-    def counts(self, by_action: bool) -> Floats:
+    def counts(self, size: int) -> Floats:
         """How often each cell was visited, (S, 2) or (S, 1)."""
-        n = N_STATES * (N_ACTIONS if by_action else 1)
-        counts = np.bincount(self.cells(by_action), minlength=n).astype(np.float64)
+        counts = np.bincount(self.cells(size), minlength=size).astype(np.float64)
         return counts.reshape(N_STATES, -1)
 
 

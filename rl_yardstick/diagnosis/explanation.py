@@ -20,7 +20,7 @@ A part says where the return is lost, not why. `diagnosis.proposals` says what m
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -147,6 +147,8 @@ class Task(NamedTuple):
     discount: float
     epsilon: float  # exploration rate, if the agent learns the values of exploring, else 0
     lived: TransitionModel  # the model with these random actions
+    for_discount: Floats  # optimal action values of the model, shape (S, A)
+    own_values: Floats  # optimal action values of the objective itself
 
 
 def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> Explanation:
@@ -229,7 +231,12 @@ def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> T
     explores = learns_exploring_values(spec, agent)
     if explores and getattr(agent, "exploration", "") == "epsilon_greedy":
         epsilon = float(getattr(agent, "exploration_rate", 0.0))
-    return Task(model, float(discount), epsilon, _noisy(model, epsilon) if epsilon > 0 else model)
+    lived = _noisy(model, epsilon) if epsilon > 0 else model
+    try:
+        values = [policy_iteration(each, discount).action_values for each in (model, lived)]
+    except ValueError:  # without a discount, where episodes need not end
+        return None
+    return Task(model, float(discount), epsilon, lived, *values)
 
 
 class Found:
@@ -258,14 +265,11 @@ class Found:
         self.groups = None
         if evaluator.scale is not None:
             self.groups = observation_groups(evaluator.observations, self.model.reachable)
-        self.task: Task | None = None
         # the values that it acts by, (S, A) or (S,); a softmax does not act by its values
         self.beliefs: Floats | None = None
         # how often each pair of state and action of a table was updated, shape (S, A)
         self.updates: Ints | None = None
-        # optimal action values for its discount, and of its own objective, shape (S, A)
-        self.for_discount: Floats | None = None
-        self.own_values: Floats | None = None
+        self.task = None if learner is None else _task(*learner, evaluator)
         if learner is None:
             return
         self.agent: Any = learner[1]
@@ -275,25 +279,20 @@ class Found:
         if counts is not None and evaluator.observations.ndim == 1:
             summed: Ints = counts.numpy().sum(axis=0)[evaluator.observations]
             self.updates = summed if summed.any() else None
-        if (task := _task(*learner, evaluator)) is not None:
-            with suppress(ValueError):  # without a discount, where episodes need not end
-                self.for_discount = policy_iteration(task.model, task.discount).action_values
-                self.own_values = policy_iteration(task.lived, task.discount).action_values
-                self.task = task
 
     # --- parts ------------------------------------------------------------------------------------
 
     def parts(self) -> tuple[Part, ...]:
         """The handicaps between the optimum and the agent, in their order."""
         task, scale = self.task, self.evaluator.scale
-        if task is None or self.for_discount is None or self.own_values is None:
+        if task is None:
             return ()
         # The part that leads to each policy, its return, and what it is.
         told = f"the best policy for discount {task.discount:g}"
-        policies = [("objective", self.best_of(self.for_discount), told)]
+        policies = [("objective", self.best_of(task.for_discount), told)]
         if task.epsilon > 0:
             told = f"the best policy that explores with epsilon {task.epsilon:g}"
-            policies.append(("exploring", self.best_of(self.own_values), told))
+            policies.append(("exploring", self.best_of(task.own_values), told))
         if scale is not None and scale.best is not None:
             told = "the best memoryless policy"
             told += "" if scale.best.lower == scale.best.upper else " found"
@@ -358,10 +357,10 @@ class Found:
     def own_gap(self) -> float | None:
         """The gap at the start in its own objective, without a time limit; None if unknown."""
         task = self.task
-        if task is None or self.own_values is None or task.discount >= 1:
+        if task is None or task.discount >= 1:
             return None
         own = policy_return(task.lived, self.taken, None, task.discount).expected_return
-        return max(float(task.lived.initial @ self.own_values.max(axis=1)) - own, 0.0)
+        return max(float(task.lived.initial @ task.own_values.max(axis=1)) - own, 0.0)
 
     # --- on the way -------------------------------------------------------------------------------
 
@@ -380,12 +379,12 @@ class Found:
 
     def states(self) -> tuple[StateLoss, ...]:
         """The 20 states that lose most, the worst first."""
-        split, found = self.split, []
+        split, true, found = self.split, None if self.task is None else self.task.own_values, []
         for state in np.argsort(-split.losses, kind="stable")[:20].tolist():
             pair = [int(self.taken[state]), int(split.action_values[state].argmax())]
             own = [
                 None if t is None or t.ndim != 2 or self.groups is not None else t[state, pair]
-                for t in (self.beliefs, self.own_values, self.updates)
+                for t in (self.beliefs, true, self.updates)
             ]
             known = [None if two is None else tuple(two.tolist()) for two in own]
             loss, visits = float(split.losses[state]), float(split.visits[state])

@@ -122,7 +122,7 @@ class OfDQN:
         places = asked.call_args.args[0]
         log, newer = Steps(copies.logs[0]), np.where(places < n - 130, places + 130, places)
         self.steps, self.oldest = log.take(newer), log.take(places)
-        self.cells = self.steps.cells(by_action=True)
+        self.cells = self.steps.cells(self.q.size)
 
     def _moved(self, batch: Any) -> Floats:
         """By how much one update moves the parameters, times the steps in it."""
@@ -213,7 +213,7 @@ class OfDQN:
             for name, errors, cells in rows:
                 mean = np.atleast_2d(np.clip(errors, -most, most)).mean(axis=0)
                 yield f"{name} ({loss})", mean @ cells @ self.slopes
-        old, old_cells = self.oldest, self.oldest.cells(by_action=True)
+        old, old_cells = self.oldest, self.oldest.cells(q.size)
         errors = BACKUPS[RIGHT](old, self.largest.take) - q.ravel()[old_cells]
         yield "stale-buffer", np.clip(errors, -1, 1) @ self.slopes[old_cells]
         yield f"{RIGHT} (absolute)", np.sign(targets[RIGHT] - own) @ did @ self.slopes

@@ -34,18 +34,17 @@ from rl_yardstick.mdp import (
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.components import constructor_parameters, schedule
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
-from rl_yardstick.pipeline.settings import entry_names, literal, shipped_hyperparams
+from rl_yardstick.pipeline.settings import BUDGETS, entry_names, literal, shipped_hyperparams
 from rl_yardstick.pipeline.spec import TrainSpec
 
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.explanation import Found, Part, Task
 
-STEPS, EPISODES = "n_timesteps", "n_episodes"
+STEPS, EPISODES = BUDGETS
 VARIANT = ("train_env_kwargs", "train_env_wrapper")
-FIRST, LAST, FRACTION, DECAY = EXPLORATION = (
-    *("exploration_initial_eps", "exploration_final_eps"),
-    *("exploration_fraction", "exploration_decay"),
-)
+FIRST, LAST = "exploration_initial_eps", "exploration_final_eps"
+FRACTION, DECAY = "exploration_fraction", "exploration_decay"
+EXPLORATION = (FIRST, LAST, FRACTION, DECAY)
 # Settings with a rule of their own, and settings that are no cause.
 _WITH_RULE = {*EXPLORATION, "gamma", "learning_rate", "initial_q", "policy_kwargs"}
 _NO_CAUSE = {"policy", "engine", "mask_actions", "seed", "device", "verbose"}
@@ -145,8 +144,8 @@ class _Case:
             self.limit = time_limit(env) or found.horizon
         # the best actions for the agent's own objective, and the share of each state in their
         # steps, shape (S,); 0 where they are unknown
-        is_known = found.own_values is not None and found.groups is None
-        values = found.split.action_values if found.own_values is None else found.own_values
+        is_known = found.task is not None and found.groups is None
+        values = found.split.action_values if found.task is None else found.task.own_values
         self.best: Ints = values.argmax(axis=1)
         visits = state_visitation(found.model, self.best, found.horizon)
         self.path: Floats = visits / visits.sum() * is_known
@@ -214,19 +213,18 @@ class _Case:
     def _objective(self) -> Iterator[_Change]:
         """Training on the task as it is, another discount, other initial values."""
         own, found, task = self.own, self.found, self.found.task
-        values, before = found.own_values, found.for_discount
         differs = {VARIANT[0]: bool(training_changes(self.spec)), VARIANT[1]: True}
         changed = [key for key in VARIANT if own.get(key) and differs[key]]
         share = 0.0
-        if changed and task is not None and before is not None:
-            share = self._gain(found.model, task.discount, before)
+        if changed and task is not None:
+            share = self._gain(found.model, task.discount, task.for_discount)
         if odd := [key for key in VARIANT if key in self.odd]:
             change = {key: self.usual.get(key) for key in odd}
             yield change, len(odd) + 8 * self.out_of_reach, share
         if kept := [key for key in changed if key not in odd]:
             weight = 0.1 * self.is_network + 8 * self.out_of_reach
             yield dict.fromkeys(kept), weight, 0.0 if odd else share
-        if task is None or values is None:
+        if task is None:
             return
         nearer = round(1 - 0.5 / found.horizon, 7)
         if self.odd.get("gamma", 0.0) > 0:
@@ -234,13 +232,13 @@ class _Case:
         if "gamma" in self.known and task.discount < nearer:
             # An agent that explores too much, or lacks steps, may value the start so as well.
             away = max(-self._away("gamma"), 0.0)
-            own_start, best_start = self._standing_still(task, values)
+            own_start, best_start = self._standing_still(task)
             stands = STANDS_STILL[0] <= own_start <= STANDS_STILL[1] and best_start > HARDLY_MORE
             stands = stands and ("gamma" in self.odd or not self.is_entry)
             weight = 4.0 * stands + 0.15 * away
-            yield {"gamma": "auto"}, weight, self._gain(task.lived, nearer, values)
+            yield {"gamma": "auto"}, weight, self._gain(task.lived, nearer, task.own_values)
         if "initial_q" in self.known:
-            best = values.max(axis=1)[task.model.reachable]
+            best = task.own_values.max(axis=1)[task.model.reachable]
             usual, high = self.usual["initial_q"], float(f"{best.max():.3g}")
             high = usual if usual > own["initial_q"] else high
             # Values below all true ones hide every action that was not tried.
@@ -254,7 +252,7 @@ class _Case:
             if above > 1 and usual < own["initial_q"]:
                 yield {"initial_q": usual}, min(above, 4.0), 0.0
 
-    def _standing_still(self, task: Task, best: Floats) -> tuple[float, float]:
+    def _standing_still(self, task: Task) -> tuple[float, float]:
         """Its start value, and the best, divided by that of standing still; 0 if unknown."""
         model, own, policy = task.model, self.found.beliefs, self.found.agent.policy
         stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated
@@ -264,8 +262,8 @@ class _Case:
         standing = float(model.reward[stays].max()) / (1 - task.discount)
         if standing >= 0:
             return 0.0, 0.0
-        own_start, best_start = (float(model.initial @ q.max(axis=1)) for q in (own, best))
-        return own_start / standing, best_start / standing
+        starts = [float(model.initial @ q.max(axis=1)) for q in (own, task.own_values)]
+        return starts[0] / standing, starts[1] / standing
 
     def _gain(self, model: TransitionModel, discount: float, before: Floats) -> float:
         """The share of the gap that planning with another model or discount closes."""

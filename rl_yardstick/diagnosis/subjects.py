@@ -25,6 +25,7 @@ from rl_yardstick.pipeline.errors import UserError, one_line, unknown
 from rl_yardstick.pipeline.spec import validated
 
 SpaceKind = Literal["discrete", "box"]  # of observations
+Settings = Mapping[str, Any]
 
 # What an algorithm claims to be, and its next value: a rule of `backups`, or that of states.
 KINDS: Mapping[str, str] = {
@@ -79,7 +80,7 @@ class Subject(ABC):
     """An algorithm under audit."""
 
     kind: str | None = None  # one of `KINDS`; None if it is not known
-    typed: Mapping[str, Any]  # settings that the user gave
+    typed: Settings  # settings that the user gave
     parameters: Mapping[str, inspect.Parameter]
     observes: SpaceKind  # the kind of observations
     kinds: Sequence[SpaceKind] = ("box", "discrete")  # that are tried, in this order
@@ -90,7 +91,7 @@ class Subject(ABC):
         self.is_one_step = not re.search(_LONGER, f"{name} {kind} {doc}", re.I)
 
     @abstractmethod
-    def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
+    def run(self, make_env: Copies, seed: int, steps: int, changes: Settings) -> Any:
         """A model that is trained, with ``predict``."""
 
     def train(self, steps: int, seed: int, bump: int = -1, **changes: Any) -> Trained:
@@ -135,7 +136,7 @@ class Subject(ABC):
 
 # Families of the library and of ours: what they claim to be, and settings under which they learn
 # this world in few steps. Settings that a class does not have are left out.
-_NETWORK: Mapping[str, Any] = {
+_NETWORK: Settings = {
     "learning_rate": 3e-3,
     "buffer_size": 4000,
     "learning_starts": 100,
@@ -145,7 +146,7 @@ _NETWORK: Mapping[str, Any] = {
     "n_epochs": 10,
     "policy_kwargs": {"net_arch": [32]},
 }
-_FAMILIES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+_FAMILIES: Mapping[str, tuple[str, Settings]] = {
     **dict.fromkeys(("NStepTreeBackup", "ExpectedSARSA"), ("expected_sarsa", {})),
     **dict.fromkeys(("NStepSARSA", "SARSALambda", "SARSA", "SemiGradientSARSA"), ("sarsa", {})),
     "MonteCarlo": ("sarsa", {"learning_rate": 0.1}),
@@ -158,7 +159,7 @@ _FAMILIES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "DQN": ("q_learning", _NETWORK),
     "OnPolicyAlgorithm": ("actor_critic", {**_NETWORK, "n_steps": 128}),
 }
-_EXPLORES = {"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0}
+_EXPLORES: Settings = {"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0}
 
 
 class ClassSubject(Subject):
@@ -169,11 +170,7 @@ class ClassSubject(Subject):
     """
 
     def __init__(
-        self,
-        name: str,
-        typed: Mapping[str, Any],
-        kind: str | None = None,
-        wanted: SpaceKind | None = None,
+        self, name: str, typed: Settings, kind: str | None = None, wanted: SpaceKind | None = None
     ) -> None:
         cls: Any = load_algorithm(name)
         plain = getattr(cls, "plain", None)
@@ -202,13 +199,13 @@ class ClassSubject(Subject):
         self.typed = constructor_arguments(spec, cls, is_dict=False)
         self.find_observations(wanted)
 
-    def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
+    def run(self, make_env: Copies, seed: int, steps: int, changes: Settings) -> Any:
         wanted = {**self.base, "gamma": GAMMA, "seed": seed, "device": "cpu"}
         model = self.made(make_env, {**wanted, **self.typed, **changes})
         model.learn(steps)
         return model
 
-    def made(self, make_env: Copies, wanted: Mapping[str, Any]) -> Any:
+    def made(self, make_env: Copies, wanted: Settings) -> Any:
         """An untrained model, with those of the settings that its class has."""
         from stable_baselines3.common.logger import Logger
 
@@ -247,7 +244,7 @@ class ScriptSubject(Subject):
         self,
         name: str,
         function: Callable[..., Any],
-        typed: Mapping[str, Any],
+        typed: Settings,
         kind: str | None = None,
         wanted: SpaceKind | None = None,
     ) -> None:
@@ -269,7 +266,7 @@ class ScriptSubject(Subject):
                 raise unknown(f"-params: unknown argument of {name}", key, self.parameters)
         self.find_observations(wanted)
 
-    def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
+    def run(self, make_env: Copies, seed: int, steps: int, changes: Settings) -> Any:
         settings: Any = {"seed": seed, "gamma": GAMMA, **deepcopy(dict(self.typed)), **changes}
         agent = self.function(make_env=make_env, steps=steps, **settings)
         if not callable(getattr(agent, "act", None)):
