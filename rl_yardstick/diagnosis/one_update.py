@@ -430,11 +430,12 @@ class OfActor:
 
     def _minibatches(self) -> Iterator[Found]:
         model, _ = new_model(self.subject, n_steps=96, batch_size=32, n_epochs=3)
-        evaluate = model.policy.evaluate_actions
-        with patch.object(model.policy, "evaluate_actions", wraps=evaluate) as asked:
+        policy = model.policy
+        with patch.object(policy, "evaluate_actions", wraps=policy.evaluate_actions) as asked:
             by_user(model.learn, 96)
-        seen = [b"".join(each.numpy().tobytes() for each in call.args) for call in asked.mock_calls]
-        n, n_different = len(seen), len(set(seen))
+        batches = [call.args for call in asked.call_args_list]
+        n_different = len({b"".join(each.numpy().tobytes() for each in one) for one in batches})
+        n = len(batches)
         if (n_different, n) != (9, 9):
             told = f"{n_different} different minibatches in {n} updates; right would be 9"
             yield "minibatches-reused" if n == 9 else "minibatches-or-epochs", told

@@ -213,8 +213,7 @@ class _Case:
     def _objective(self) -> Iterator[_Change]:
         """Training on the task as it is, another discount, other initial values."""
         own, found, task = self.own, self.found, self.found.task
-        differs = {VARIANT[0]: bool(training_changes(self.spec)), VARIANT[1]: True}
-        changed = [key for key in VARIANT if own.get(key) and differs[key]]
+        changed = [key for key in VARIANT if own.get(key) and training_changes(self.spec)]
         share = 0.0
         if changed and task is not None:
             share = self._gain(found.model, task.discount, task.for_discount)
@@ -255,8 +254,8 @@ class _Case:
     def _standing_still(self, task: Task) -> tuple[float, float]:
         """Its start value, and the best, divided by that of standing still; 0 if unknown."""
         model, own, policy = task.model, self.found.beliefs, self.found.agent.policy
-        stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated
-        stays &= (model.prob > 0) & model.reachable[:, None, None]
+        own_state = np.arange(model.n_states)[:, None, None]
+        stays = model.goes_on & (model.next_state == own_state) & model.reachable[:, None, None]
         if own is None or not hasattr(policy, "q_tables") or not stays.any() or task.discount >= 1:
             return 0.0, 0.0
         standing = float(model.reward[stays].max()) / (1 - task.discount)
@@ -367,7 +366,7 @@ class _Case:
     def _chance_out_of_reach(self) -> float:
         """The share of best episodes that meet states beyond the time limit of training."""
         model = self.model
-        here, goes = model.initial > 0, (model.prob > 0) & ~model.terminated
+        here, goes = model.initial > 0, model.goes_on
         for _ in range(min(self.limit, model.n_states) - 1):
             here[model.next_state[here][goes[here]]] = True
         meets = ~here[model.next_state] & goes
