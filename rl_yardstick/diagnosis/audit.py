@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from rl_yardstick.diagnosis.backups import (
     RIGHT,
+    RULES,
+    Found,
     Measured,
     candidates,
     fault_of,
     is_table,
     measured,
 )
-from rl_yardstick.diagnosis.composite_world import BETTER, END, GAMMA, N_STATES, STORIES, Steps
+from rl_yardstick.diagnosis.composite_world import BETTER, END, GAMMA, STORIES, Steps
 from rl_yardstick.diagnosis.subjects import KINDS, CannotTrain, Subject
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.errors import UserError
@@ -59,12 +60,15 @@ class Verdict:
     def as_json(self) -> dict[str, Any]:
         """The verdict as JSON."""
         words = {"right": "right", "wrong": "fault", "unreadable": "nothing can be said"}
-        told: dict[str, Any] = {
+        return {
+            "algorithm": self.subject,
+            "verdict": words[self.state],
             "measured": self.measured and self.measured._asdict(),
             "notes": [*self.notes],
+            "fault": self.fault or None,
+            "target": self.target,
+            "not_seen": self.unseen,
         }
-        told |= {"fault": self.fault or None, "target": self.target, "not_seen": self.unseen}
-        return {"algorithm": self.subject, "verdict": words[self.state], **told}
 
 
 def audit(subject: Subject, seeds: int = 0) -> Verdict:
@@ -81,7 +85,7 @@ def audit(subject: Subject, seeds: int = 0) -> Verdict:
             warnings.simplefilter("ignore")
             if (found := audit_update(subject)) is None:
                 return _ByValues(subject, seeds).verdict()
-        told, (fault, note) = found[0], found[1] or ("", "")
+        told, (fault, note) = found
         state: State = "wrong" if note else "right"
         return Verdict(subject.name, state, fault, told.words(), (note,) * bool(note), "", told)
     except CannotTrain as error:
@@ -114,26 +118,24 @@ class _Training(NamedTuple):
     act: Callable[[int], int]
 
 
-def nearest(trainings: Sequence[_Training], rule: str) -> list[Near]:
-    """All formulas, the nearest first: differences are averaged over seeds before they count."""
-    sums: dict[str, list[Floats]] = {}
+def nearest(trainings: Sequence[_Training], rule: str) -> tuple[Near, list[Near]]:
+    """The right formula, and all, the nearest first: differences are averaged over seeds."""
+    sums: dict[str, Floats] = {}
     for one in trainings:
-        counts = one.steps.counts(one.values.shape[1] > 1)
+        uses = (one.steps.counts(one.values.size) >= VISITS).astype(float)
+        uses[END] = 0.0
         for found in candidates(one.steps, rule, one.values, one.first):
-            uses = (counts >= VISITS).astype(float)
-            uses[END] = 0.0
             tolerance = 0.08 + 0.05 * np.abs(found.values) + 0.35 * found.spread
-            parts = [uses * (one.values - found.values), uses * tolerance, uses]
-            before = sums.setdefault(found.name, [0.0 * uses] * 3)
-            sums[found.name] = [a + b for a, b in zip(before, parts, strict=True)]
-    ranking = []
+            parts = uses * [one.values - found.values, tolerance, np.ones_like(uses)]
+            sums[found.name] = sums.get(found.name, 0.0) + parts
+    ranking = {}
     for name, (difference, tolerance, uses) in sums.items():
         is_used = uses > 0
         if not is_used.any():
             raise UserError(f"no state was visited {VISITS} times: it trained for too few steps")
         z = np.abs(difference[is_used] / tolerance[is_used])
-        ranking.append(Near(float(np.sqrt(np.mean(z**2))), float(z.max()), name))
-    return sorted(ranking)
+        ranking[name] = Near(float(np.sqrt(np.mean(z**2))), float(z.max()), name)
+    return ranking[RIGHT], sorted(ranking.values())
 
 
 @dataclass
@@ -155,9 +157,8 @@ class _ByValues:
             trainings = self._trainings(times * length, n_seeds)
             if not np.isfinite([one.values for one in trainings]).all():
                 return Verdict(self.subject.name, "wrong", notes=("its values are not finite",))
-            rule, near = self._by_rules(trainings)
-            right = next(each for each in near if each.name == RIGHT)
-            found = self._judged(trainings, rule, near, right)
+            rule, right, near = self._by_rules(trainings)
+            found = self._judged(trainings, rule, right, near)
             if found.state == "right" or found.fault or right.rms > 0.9 * before:
                 return found
             before, last = right.rms, before
@@ -166,9 +167,7 @@ class _ByValues:
             return replace(found, state="unreadable", notes=(note,))
         return found
 
-    def _trainings(
-        self, n: int, n_seeds: int, changes: Mapping[str, Any] = MappingProxyType({})
-    ) -> list[_Training]:
+    def _trainings(self, n: int, n_seeds: int, /, **changes: Any) -> list[_Training]:
         found = []
         for seed in range(1, 1 + n_seeds):
             trained, begun = (self.subject.train(steps, seed, **changes) for steps in (n, 3))
@@ -178,29 +177,24 @@ class _ByValues:
             found.append(_Training(trained.values, begun.values, steps, trained.act))
         return found
 
-    def _by_rules(self, trainings: Sequence[_Training]) -> tuple[str, list[Near]]:
+    def _by_rules(self, trainings: Sequence[_Training]) -> tuple[str, Near, list[Near]]:
         """The rule of the next value, the nearest right one if the kind is not known."""
         rule = KINDS.get(self.subject.kind or "", "")
-        rules = [rule] if rule not in ("", "states") else ["largest", "next", "expected"]
+        rules = [rule] if rule in RULES else ["largest", "next", "expected"]
         if trainings[0].values.shape[1] == 1:
             rules = ["states"]
-        ranked = {rule: nearest(trainings, rule) for rule in rules}
-
-        def distance(rule: str) -> float:
-            return next(near.rms for near in ranked[rule] if near.name == RIGHT)
-
-        best = min(ranked, key=distance)
-        return best, ranked[best]
+        ranked = [(rule, *nearest(trainings, rule)) for rule in rules]
+        return min(ranked, key=lambda each: each[1].rms)
 
     def _judged(
-        self, trainings: Sequence[_Training], rule: str, near: list[Near], right: Near
+        self, trainings: Sequence[_Training], rule: str, right: Near, near: list[Near]
     ) -> Verdict:
         one = trainings[-1]
         backup = measured(one.values, one.steps, rule)
         verdict = partial(Verdict, self.subject.name, target=backup.words(), measured=backup)
         if right.rms <= 0.5 and right.worst <= 3 and right.rms <= near[0].rms + 0.1:
-            if other_fault := self._other_fault(trainings, rule):
-                return verdict("wrong", other_fault[0], notes=(other_fault[1],))
+            for fault, note in self._other_faults(trainings, rule):
+                return verdict("wrong", fault, notes=(note,))
             unseen = UNSEEN_OF_ACTORS if rule == "states" else UNSEEN
             return verdict("right", unseen="" if self.is_table else unseen)
         tight = 0.25 if self.is_table else 0.5
@@ -215,32 +209,30 @@ class _ByValues:
         is_named &= self.subject.is_one_step or not fault.startswith(OF_ONE_STEP)
         return verdict("wrong", fault if is_named else "", notes=(note,))
 
-    def _other_fault(self, trainings: Sequence[_Training], rule: str) -> tuple[str, str] | None:
-        """A fault that leaves the values right, and the sentence that shows it."""
-        checks: list[Callable[[], tuple[str, str] | None]] = [partial(_choices, trainings)]
+    def _other_faults(self, trainings: Sequence[_Training], rule: str) -> Iterator[Found]:
+        """Faults that leave the values right."""
+        yield from _choices(trainings)
         if self.is_table:
-            checks.append(partial(_credit, self.subject))
-        checks.append(partial(self._with_other_settings, rule))
-        return next(filter(None, (check() for check in checks)), None)
+            yield from _credit(self.subject)
+        with suppress(CannotTrain):  # it may not be made for other settings
+            yield from self._with_other_settings(rule)
 
-    def _with_other_settings(self, rule: str) -> tuple[str, str] | None:
+    def _with_other_settings(self, rule: str) -> Iterator[Found]:
         """What it does without exploration, and with rollouts of two steps, if it has settings."""
         rates = {name: 1e-9 for name in self.subject.parameters if RATES.match(name)}
         length = self.subject.named(*ROLLOUTS)
-        with suppress(CannotTrain):  # it may not be made for such settings
-            if rates and rule != "states":
-                [(q, _, d, _)] = self._trainings(self.length // 2, 1, rates)
-                is_clear = (d.weight > 0) & (np.ptp(q, axis=1)[d.state] > 0.3)
-                share = float(np.mean((q[d.state, d.action] < q.max(axis=1)[d.state])[is_clear]))
-                if share > 0.25:
-                    told = f"{share:.0%} of its actions are not its best"
-                    return "exploration-inverted", f"with {' and '.join(rates)} at 0, {told}"
-            if length:
-                [(q, _, d, _)] = short = self._trainings(self.length, 1, {length: 2})
-                right = next(near for near in nearest(short, rule) if near.name == RIGHT)
-                if right.rms > 1 and any((found := measured(q, d, rule)).off()):
-                    return "", f"with {length} at 2, {found.words()}"
-        return None
+        if rates and rule != "states":
+            [(q, _, d, _)] = self._trainings(self.length // 2, 1, **rates)
+            is_clear = (d.weight > 0) & (np.ptp(q, axis=1)[d.state] > 0.3)
+            share = float(np.mean((q[d.state, d.action] < q.max(axis=1)[d.state])[is_clear]))
+            if share > 0.25:
+                told = f"{share:.0%} of its actions are not its best"
+                yield "exploration-inverted", f"with {' and '.join(rates)} at 0, {told}"
+        if length:
+            [(q, _, d, _)] = short = self._trainings(self.length, 1, **{length: 2})
+            found = measured(q, d, rule)
+            if nearest(short, rule)[0].rms > 1 and any(found.off()):
+                yield "", f"with {length} at 2, {found.words()}"
 
 
 ACTS_WORSE = "advantage-sign or ratio-inverted"  # from outside they are the same
@@ -249,28 +241,29 @@ UNSEEN_OF_ACTORS = "the trace, normalisation, clipping, minibatches"
 NO_VALUES = "add the method values(obs): a list with a number for each action, or the state's value"
 
 
-def _choices(trainings: Sequence[_Training]) -> tuple[str, str] | None:
+def _choices(trainings: Sequence[_Training]) -> Iterator[Found]:
     """What it does where one action pays more: an actor late in training, others when asked."""
     if trainings[0].values.shape[1] == 1:
         steps = [one.steps for one in trainings]
-        late = [(d.weight > 0) & np.isin(d.state, [*BETTER]) for d in steps]
-        better = np.array([BETTER.get(state, -1) for state in range(N_STATES)])
-        hits = [d.action[use] == better[d.state[use]] for d, use in zip(steps, late, strict=True)]
+        hits = [(d.action == d.better)[(d.weight > 0) & (d.better >= 0)] for d in steps]
         share = float(np.mean(np.concatenate(hits)))
-        text = f"late in training it does the action that pays more in {share:.0%}"
-        return None if share > 0.6 else (ACTS_WORSE if share < 0.35 else "", text)
+        if share <= 0.6:
+            told = f"late in training it does the action that pays more in {share:.0%}"
+            yield ACTS_WORSE if share < 0.35 else "", told
+        return
     asked = [
         np.mean([one.act(state) == BETTER[state] for _ in range(200)])
         for one in trainings
         for state in (13, 14)
     ]
     low, high = min(asked), max(asked)
-    text = f"it does the action that pays in {low:.0%} to {high:.0%} of 200 times, when evaluated"
-    fault = "acts-by-the-worst-value" if high < 0.03 else "explores-in-evaluation"
-    return None if low > 0.99 else (fault, text)
+    if low <= 0.99:
+        fault = "acts-by-the-worst-value" if high < 0.03 else "explores-in-evaluation"
+        shares = f"{low:.0%} to {high:.0%} of 200 times"
+        yield fault, f"it does the action that pays in {shares}, when evaluated"
 
 
-def _credit(subject: Subject) -> tuple[str, str] | None:
+def _credit(subject: Subject) -> Iterator[Found]:
     """What the reward of one step changes: nothing of an earlier episode, nothing by chance."""
     name = subject.named("trace_decay", "lam", "lambda_", "lmbda")
     decay = {} if name is None else {name: 0.5}
@@ -281,9 +274,9 @@ def _credit(subject: Subject) -> tuple[str, str] | None:
         return found
 
     if changed(25, 10**9).max() > 0:
-        return "not-reproducible", "two trainings with the same seed differ"
+        yield "not-reproducible", "two trainings with the same seed differ"
     if len(subject.train(10, 1).logs) != 1:  # of copies it is not known which one is first
-        return None
+        return
     starts = np.cumsum([len(story.states) for story in STORIES[:4]]).tolist()
     for first, end in pairwise(starts):
         change = changed(end, first)
@@ -291,11 +284,10 @@ def _credit(subject: Subject) -> tuple[str, str] | None:
         if leak := sorted(earlier & set(np.flatnonzero(change > 1e-9).tolist())):
             text = f"the reward of step {first + 1}, the first of an episode, changes state "
             text += f"{leak[-1]} of an earlier one by {change[leak[-1]]:.3f}"
-            return "traces-not-reset", text
+            yield "traces-not-reset", text
     *_, before, last = STORIES[1].states
     back = [changed(starts[1], starts[1] - 1, seed) for seed in range(1, 7)]
     shares = [change[before] / change[last] for change in back if change[last]]
     if decay and shares and abs(max(shares) - 0.5 * GAMMA) > 0.01:
         text = f"credit fades to {max(shares):.2f} with a step back at lambda 0.5"
-        return "trace-decay", f"{text}; right would be {0.5 * GAMMA:g}"
-    return None
+        yield "trace-decay", f"{text}; right would be {0.5 * GAMMA:g}"

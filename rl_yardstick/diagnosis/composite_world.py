@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,36 +11,17 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.mdp.transition_model import Floats, Ints
 
-Ints = NDArray[np.int64]
 Row = tuple[int, int, float, int, bool, bool]  # state, action, reward, shown, terminated, truncated
 
 GAMMA = 0.8
 N_STATES, N_ACTIONS = 20, 2
 END = 17  # the end of an episode shows this where it shows no other state
 PLAIN, LUCKY = 16, 18  # follow state 15 in turn
-_PAYS: Mapping[int, tuple[float, float]] = {  # rewards of the actions in each state
-    0: (1, 1),
-    1: (0.5, 0.5),
-    2: (0, 0),
-    3: (0, 0),
-    4: (2, 0),
-    5: (1, 1),
-    6: (0.6, 0.6),
-    7: (1, 1),
-    8: (4, 4),
-    9: (-3, -3),
-    10: (5, 5),
-    11: (0.5, 0),
-    12: (-3, 1),
-    13: (8, 0),
-    14: (0, 2),
-    15: (0, 0),
-    PLAIN: (0, 0),
-    LUCKY: (4, 4),
-    19: (-1, -1),
-}
+# The reward in each state, 0 where nothing is given; and of each action where they differ.
+_PAYS = {0: 1.0, 1: 0.5, 5: 1.0, 6: 0.6, 7: 1.0, 8: 4.0, 9: -3.0, 10: 5.0, LUCKY: 4.0, 19: -1.0}
+_PAYS_BY_ACTION = {4: (2.0, 0.0), 11: (0.5, 0.0), 12: (-3.0, 1.0), 13: (8.0, 0.0), 14: (0.0, 2.0)}
 BETTER = {13: 0, 14: 1, 12: 1, 4: 0}  # the better action where they differ
 
 
@@ -107,7 +87,9 @@ class CompositeWorld(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Go on in the story."""
         story, number = STORIES[self.story], int(np.asarray(action).reshape(-1)[0])
-        reward = float(_PAYS[self.state][number]) + (len(self.log) == self.bump)
+        pay = _PAYS.get(self.state, 0.0)
+        reward = _PAYS_BY_ACTION.get(self.state, (pay, pay))[number]
+        reward += len(self.log) == self.bump
         self.place += 1
         is_over = self.place == len(story.states)
         shown = story.shows if is_over else story.states[self.place]
@@ -122,30 +104,27 @@ class CompositeWorld(gym.Env[Any, Any]):
 class Steps:
     """A log as arrays of shape (n,), one entry for each step."""
 
-    state: Ints
-    action: Ints
-    reward: Floats
-    shown: Ints  #: the observation after the step
-    terminated: Floats  #: 1 or 0
-    truncated: Floats
-    weight: Floats  #: 1 for those that count
-
     def __init__(self, rows: list[Row], late: float = 1.0) -> None:
-        columns = [np.array(column) for column in zip(*rows, strict=True)]
-        self.state, self.action, self.shown = columns[0], columns[1], columns[3]
-        self.reward, self.terminated, self.truncated = (columns[i] * 1.0 for i in (2, 4, 5))
+        columns: Any = (np.array(column) for column in zip(*rows, strict=True))
+        self.state, self.action, self.reward, self.shown, *ends = columns
+        self.terminated, self.truncated = (end * 1.0 for end in ends)  #: 1 or 0
         self.over: Floats = np.maximum(self.terminated, self.truncated)
+        self.goes_on: Floats = 1 - self.terminated
         n = len(rows)
+        #: 1 for those that count
         self.weight = (np.arange(n) >= int(n * (1 - late))).astype(np.float64)
         self.next_state = np.roll(self.state, -1)  #: of the next step, also in the next episode
+        #: the same at an episode's end, and elsewhere what the step shows
+        self.following = np.where(self.over > 0, self.next_state, self.shown)
         self.next_action, self.action_before = np.roll(self.action, -1), np.roll(self.action, 1)
         self.next_reward, self.reward_before = np.roll(self.reward, -1), np.roll(self.reward, 1)
         self.is_first: Floats = np.roll(self.over, 1)
         self.is_first[0] = 1.0
-        choices = np.array([BETTER.get(state, -1) for state in range(N_STATES)])[self.state]
-        is_worse = (choices >= 0) & (self.action != choices)
+        #: the better action, -1 where both are the same
+        self.better = np.array([BETTER.get(state, -1) for state in range(N_STATES)])[self.state]
+        is_worse = (self.better >= 0) & (self.action != self.better)
         smooth = np.ones(601 if n > 1200 else n)  # over time, since exploration may fall
-        near = [np.convolve(each, smooth, "same") for each in (is_worse, choices >= 0)]
+        near = [np.convolve(each, smooth, "same") for each in (is_worse, self.better >= 0)]
         self.exploration = np.minimum(2 * near[0] / np.maximum(near[1], 1), 1).astype(np.float64)
 
     def take(self, places: Ints) -> Steps:
@@ -162,22 +141,22 @@ class Steps:
             setattr(both, name, np.concatenate([each, getattr(other, name)]))
         return both
 
-    def cells(self, by_action: bool) -> Ints:
-        """The number of each step's cell: of the state, or of the state and action."""
-        return self.state * N_ACTIONS + self.action if by_action else self.state
+    def cells(self, size: int) -> Ints:
+        """The number of each step's cell, of ``size``: its state, or its state and action."""
+        cells: Ints = self.state if size == N_STATES else self.state * N_ACTIONS + self.action
+        return cells
 
-    def means(self, target: Floats, by_action: bool) -> tuple[Floats, Floats]:
+    def means(self, target: Floats, size: int) -> tuple[Floats, Floats]:
         """The weighted mean and spread of a target in each cell, (S, 2) or (S, 1); 0 if empty."""
-        cells, n = self.cells(by_action), N_STATES * (N_ACTIONS if by_action else 1)
-        total = np.maximum(np.bincount(cells, self.weight, n), 1e-9)
-        mean = np.bincount(cells, self.weight * target, n) / total
-        variance = np.bincount(cells, self.weight * (target - mean[cells]) ** 2, n) / total
+        cells = self.cells(size)
+        total = np.maximum(np.bincount(cells, self.weight, size), 1e-9)
+        mean = np.bincount(cells, self.weight * target, size) / total
+        variance = np.bincount(cells, self.weight * (target - mean[cells]) ** 2, size) / total
         return mean.reshape(N_STATES, -1), np.sqrt(variance).reshape(N_STATES, -1)
 
-    def counts(self, by_action: bool) -> Floats:
+    def counts(self, size: int) -> Floats:
         """How often each cell was visited, (S, 2) or (S, 1)."""
-        n = N_STATES * (N_ACTIONS if by_action else 1)
-        counts = np.bincount(self.cells(by_action), minlength=n).astype(np.float64)
+        counts = np.bincount(self.cells(size), minlength=size).astype(np.float64)
         return counts.reshape(N_STATES, -1)
 
 

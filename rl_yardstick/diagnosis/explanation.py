@@ -19,7 +19,7 @@ A part says where the return is lost, not why. `diagnosis.proposals` says what m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -140,10 +140,6 @@ class Explanation:
         }
 
 
-# The function from a state to its name, and the names of all actions.
-_Names = tuple[Callable[[int], str], tuple[str, ...]]
-
-
 class Task(NamedTuple):
     """The objective that the agent was trained for."""
 
@@ -151,6 +147,8 @@ class Task(NamedTuple):
     discount: float
     epsilon: float  # exploration rate, if the agent learns the values of exploring, else 0
     lived: TransitionModel  # the model with these random actions
+    for_discount: Floats  # optimal action values of the model, shape (S, A)
+    own_values: Floats  # optimal action values of the objective itself
 
 
 def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> Explanation:
@@ -196,24 +194,20 @@ def explanation_of_policy(
     )
     if explained.is_optimal:
         return explained
-    task = None if learner is None else _task(*learner, evaluator)
-    found = Found(evaluator, None if learner is None else learner[1], policy, split, task)
-    known = action_names(env)
-    more = (f"action {action}" for action in range(len(known), evaluator.model.n_actions))
-    names = partial(state_name, env, evaluator.layout), (*known, *more)
-    alike = None if found.groups is None else found.alike(names)
+    found = Found(env, evaluator, policy, split, learner)
+    alike = found.alike()
     explained = replace(
         explained,
         parts=found.parts(),
-        states=found.states(names),
-        repairs=() if alike else found.repairs(names),
-        discount=None if task is None else task.discount,
+        states=found.states(),
+        repairs=() if alike else found.repairs(),
+        discount=None if found.task is None else found.task.discount,
         own_gap=found.own_gap(),
         is_caught=found.is_caught(),
-        looks_alike=alike is not None,
+        looks_alike=bool(alike),
     )
-    if alike is not None or not explained.is_concentrated:
-        explained = replace(explained, road=alike or found.road(names))
+    if not explained.is_concentrated:
+        explained = replace(explained, road=alike or found.road())
     if learner is None:
         return explained
     from rl_yardstick.diagnosis.proposals import proposals
@@ -237,15 +231,12 @@ def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> T
     explores = learns_exploring_values(spec, agent)
     if explores and getattr(agent, "exploration", "") == "epsilon_greedy":
         epsilon = float(getattr(agent, "exploration_rate", 0.0))
-    return Task(model, float(discount), epsilon, _noisy(model, epsilon) if epsilon > 0 else model)
-
-
-def _beliefs(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
-    """The values that an agent acts by, (S, A) or (S,); a softmax does not act by its values."""
-    from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
-    from rl_yardstick.agents.policies import own_values
-
-    return None if isinstance(agent, SoftmaxAlgorithm) else own_values(agent, observations)
+    lived = _noisy(model, epsilon) if epsilon > 0 else model
+    try:
+        values = [policy_iteration(each, discount).action_values for each in (model, lived)]
+    except ValueError:  # without a discount, where episodes need not end
+        return None
+    return Task(model, float(discount), epsilon, lived, *values)
 
 
 class Found:
@@ -253,51 +244,55 @@ class Found:
 
     def __init__(
         self,
+        env: gym.Env[Any, Any],
         evaluator: ExactEvaluator,
-        agent: BaseAlgorithm | None,
         policy: NDArray[Any],
         split: GapByState,
-        task: Task | None,
+        learner: tuple[TrainSpec, BaseAlgorithm] | None,
     ) -> None:
-        self.evaluator, self.split, self.task, self.policy = evaluator, split, task, policy
+        from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
+        from rl_yardstick.agents.policies import own_values
+
+        self.evaluator, self.split, self.policy = evaluator, split, policy
         self.model, self.horizon = evaluator.model, evaluator.horizon
-        self.agent: Any = agent
+        self.place = partial(state_name, env, evaluator.layout)
+        known = action_names(env)
+        more = (f"action {action}" for action in range(len(known), self.model.n_actions))
+        self.actions = (*known, *more)
         # the likeliest action at the first step, shape (S,)
         chances = policy_matrix(self.model, canonical_policy(self.model, policy))
         self.taken: Ints = chances.argmax(axis=1)
         self.groups = None
         if evaluator.scale is not None:
             self.groups = observation_groups(evaluator.observations, self.model.reachable)
-        self.beliefs = None if agent is None else _beliefs(agent, evaluator.observations)
+        # the values that it acts by, (S, A) or (S,); a softmax does not act by its values
+        self.beliefs: Floats | None = None
         # how often each pair of state and action of a table was updated, shape (S, A)
         self.updates: Ints | None = None
-        counts = getattr(getattr(agent, "policy", None), "visit_counts", None)
+        self.task = None if learner is None else _task(*learner, evaluator)
+        if learner is None:
+            return
+        self.agent: Any = learner[1]
+        if not isinstance(self.agent, SoftmaxAlgorithm):
+            self.beliefs = own_values(self.agent, evaluator.observations)
+        counts = getattr(self.agent.policy, "visit_counts", None)
         if counts is not None and evaluator.observations.ndim == 1:
             summed: Ints = counts.numpy().sum(axis=0)[evaluator.observations]
             self.updates = summed if summed.any() else None
-        # optimal action values for its discount, and of its own objective, shape (S, A)
-        self.for_discount: Floats | None = None
-        self.own_values: Floats | None = None
-        if task is not None:
-            try:
-                self.for_discount = policy_iteration(task.model, task.discount).action_values
-                self.own_values = policy_iteration(task.lived, task.discount).action_values
-            except ValueError:  # without a discount, where episodes need not end
-                self.task = None
 
     # --- parts ------------------------------------------------------------------------------------
 
     def parts(self) -> tuple[Part, ...]:
         """The handicaps between the optimum and the agent, in their order."""
         task, scale = self.task, self.evaluator.scale
-        if task is None or self.for_discount is None or self.own_values is None:
+        if task is None:
             return ()
         # The part that leads to each policy, its return, and what it is.
         told = f"the best policy for discount {task.discount:g}"
-        policies = [("objective", self.best_of(self.for_discount), told)]
+        policies = [("objective", self.best_of(task.for_discount), told)]
         if task.epsilon > 0:
             told = f"the best policy that explores with epsilon {task.epsilon:g}"
-            policies.append(("exploring", self.best_of(self.own_values), told))
+            policies.append(("exploring", self.best_of(task.own_values), told))
         if scale is not None and scale.best is not None:
             told = "the best memoryless policy"
             told += "" if scale.best.lower == scale.best.upper else " found"
@@ -318,18 +313,19 @@ class Found:
 
     def _of_values(self, task: Task, beliefs: Floats) -> Iterator[tuple[str, float, str]]:
         """The policies of an agent that has values for each state."""
+        values = beliefs if beliefs.ndim == 1 else beliefs.max(axis=1)
+        masks = self.evaluator.masks
         if self.updates is not None:
             n_tried = int((self.updates > 0)[self.model.reachable].sum())
             n_pairs = int(self.model.reachable.sum()) * self.model.n_actions
             told = f"planning on the {n_tried:,} of {n_pairs:,} pairs that it tried"
-            planned = self._planned_on_tried(task.lived, task.discount, self.updates > 0, beliefs)
-            yield "never tried", planned, told
-        values = beliefs if beliefs.ndim == 1 else beliefs.max(axis=1)
+            tried = (self.updates > 0) & (True if masks is None else masks)
+            yield "never tried", self._planned_on(tried, task, values), told
         if task.epsilon > 0 and beliefs.ndim == 2:
             values = (1 - task.epsilon) * values + task.epsilon * beliefs.mean(axis=1)
         ahead = task.model.expected_reward + task.discount * expected_next(task.model, values)
-        if self.evaluator.masks is not None:
-            ahead = np.where(self.evaluator.masks, ahead, -np.inf)
+        if masks is not None:
+            ahead = np.where(masks, ahead, -np.inf)
         seen = policy_return(self.model, ahead.argmax(axis=1), self.horizon).expected_return
         yield "not settled", seen, "one greedy improvement of the agent"
 
@@ -339,22 +335,17 @@ class Found:
         greedy = values >= top - TIE * np.maximum(1.0, np.abs(top))
         return finite_horizon_optimum(self.model, self.horizon, mask=greedy).start_value
 
-    def _planned_on_tried(
-        self, model: TransitionModel, discount: float, tried: Bools, beliefs: Floats
-    ) -> float:
+    def _planned_on(self, tried: Bools, task: Task, values: Floats) -> float:
         """The return of the best policy that takes only tried actions, bool of shape (S, A).
 
         In states without a tried action, the agent's own value and action are kept.
         """
-        if self.evaluator.masks is not None:
-            tried = tried & self.evaluator.masks
-        unknown: Bools = np.asarray(~tried.any(axis=1))
-        values = beliefs if beliefs.ndim == 1 else beliefs.max(axis=1)
+        model, unknown = task.lived, np.asarray(~tried.any(axis=1))
         reward = np.where(unknown[:, None, None], values[:, None, None], model.reward)
         ends = model.terminated | unknown[:, None, None]
         known = replace(model, terminated=ends, reward=reward, reward_variance=None)
         try:
-            plan = policy_iteration(known, discount, mask=tried | unknown[:, None])
+            plan = policy_iteration(known, task.discount, mask=tried | unknown[:, None])
         except ValueError:  # without a discount, where tried actions may never end the episode
             return self.split.value
         taken = np.eye(self.model.n_actions, dtype=np.bool_)[self.taken]
@@ -366,10 +357,10 @@ class Found:
     def own_gap(self) -> float | None:
         """The gap at the start in its own objective, without a time limit; None if unknown."""
         task = self.task
-        if task is None or self.own_values is None or task.discount >= 1:
+        if task is None or task.discount >= 1:
             return None
         own = policy_return(task.lived, self.taken, None, task.discount).expected_return
-        return max(float(task.lived.initial @ self.own_values.max(axis=1)) - own, 0.0)
+        return max(float(task.lived.initial @ task.own_values.max(axis=1)) - own, 0.0)
 
     # --- on the way -------------------------------------------------------------------------------
 
@@ -386,41 +377,42 @@ class Found:
 
     # --- by state ---------------------------------------------------------------------------------
 
-    def states(self, names: _Names) -> tuple[StateLoss, ...]:
+    def states(self) -> tuple[StateLoss, ...]:
         """The 20 states that lose most, the worst first."""
-        (place, actions), split, found = names, self.split, []
+        split, true, found = self.split, None if self.task is None else self.task.own_values, []
         for state in np.argsort(-split.losses, kind="stable")[:20].tolist():
             pair = [int(self.taken[state]), int(split.action_values[state].argmax())]
             own = [
                 None if t is None or t.ndim != 2 or self.groups is not None else t[state, pair]
-                for t in (self.beliefs, self.own_values, self.updates)
+                for t in (self.beliefs, true, self.updates)
             ]
             known = [None if two is None else tuple(two.tolist()) for two in own]
             loss, visits = float(split.losses[state]), float(split.visits[state])
-            does, best = (actions[action] for action in pair)
-            found.append(StateLoss(state, place(state), loss, visits, does, best, *known))
+            does, best = (self.actions[action] for action in pair)
+            found.append(StateLoss(state, self.place(state), loss, visits, does, best, *known))
         return tuple(one for one in found if one.loss > 0)
 
-    def repairs(self, names: _Names) -> tuple[tuple[str, float], ...]:
+    def repairs(self) -> tuple[tuple[str, float], ...]:
         """The greedy repairs that each regain a share of the gap that is worth a line."""
         found = greedy_repairs(self.model, self.policy, self.horizon, self.split, MOST_STATES)
         reached = [self.split.value, *(repair.value for repair in found)]
         too_little = np.diff(reached) < WORTH_A_LINE * self.split.gap
         n_kept = int(too_little.argmax()) if too_little.any() else len(found)
-        return tuple((names[0](repair.state), repair.value) for repair in found[:n_kept])
+        return tuple((self.place(repair.state), repair.value) for repair in found[:n_kept])
 
-    def alike(self, names: _Names) -> str:
-        """The states of the observation that the agent sees most, where several states share it."""
-        assert self.groups is not None
+    def alike(self) -> str:
+        """Which states share the observation that the agent sees most; empty where none do."""
+        if self.groups is None:
+            return ""
         visits = np.bincount(self.groups, self.split.visits)
         counts = np.bincount(self.groups, self.model.reachable)
         most = np.where(counts > 1, visits, -1.0).argmax()
         states = np.flatnonzero((self.groups == most) & self.model.reachable)
-        places = "; ".join(map(names[0], states[:MOST_STATES].tolist()))
+        places = "; ".join(map(self.place, states[:MOST_STATES].tolist()))
         more = f" and {len(states) - MOST_STATES} more" if len(states) > MOST_STATES else ""
         return f"it cannot tell {len(states)} states apart: {places}{more}"
 
-    def road(self, names: _Names) -> str:
+    def road(self) -> str:
         """How many states of the best road lead the agent to the end, and its last wrong turn.
 
         The road follows the likeliest outcomes of `direct` from the likeliest start.
@@ -433,7 +425,7 @@ class Found:
         counted = replace(model, reward=reward, reward_variance=None)
         reached = state_values(counted, self.policy, self.horizon)
         planned, taken = self.direct, self.taken
-        road, state = [int(model.initial.argmax())], 0
+        road = [int(model.initial.argmax())]
         while len(road) < min(self.horizon, model.n_states):
             pair = road[-1], planned[road[-1]]
             likeliest = int(model.prob[pair].argmax())
@@ -447,10 +439,10 @@ class Found:
         if not wrong:
             return ""
         n_sure, last = int((reached[road] > SURELY).sum()), wrong[-1]
-        does, best = (names[1][policy[last]] for policy in (taken, planned))
+        does, best = (self.actions[policy[last]] for policy in (taken, planned))
         return (
             f"on the best road of {len(road)} states it reaches the end from {n_sure}; its last "
-            f"wrong turn is at {names[0](last)}: {does}, where {best} is best"
+            f"wrong turn is at {self.place(last)}: {does}, where {best} is best"
         )
 
 

@@ -9,36 +9,35 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch as th
 from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.logger import Logger
 
 from rl_yardstick.diagnosis.backups import (
     BACKUPS,
+    NAMES_OF_RULES,
     RIGHT,
-    RULES,
+    Found,
     Measured,
     fault_of,
     fitted,
-    name_of_rule,
     next_values,
     parts_of,
 )
-from rl_yardstick.diagnosis.composite_world import GAMMA, N_STATES, Copies, Ints, Steps
+from rl_yardstick.diagnosis.composite_world import GAMMA, N_STATES, Copies, Steps
 from rl_yardstick.diagnosis.subjects import ClassSubject, Subject, by_user
 from rl_yardstick.mdp.transition_model import Floats
 
 PROGRESS, LAMBDA, ENTROPY, TAU = 0.25, 0.9, 0.1, 0.25
-Found = tuple[str, str]  # the name of a fault, empty without one, and what shows it
 OTHERWISE = "one update moves the parameters otherwise than the right one does"
 NORMALISED = "advantages-normalised-over-the-rollout"
 DOES_NOT_LEARN = ("does-not-learn", "an update leaves the parameters as they were")
 
 
-def audit_update(subject: Subject) -> tuple[Measured, Found | None] | None:
-    """The measured target and the first fault of a subclass of DQN, PPO or A2C.
+def audit_update(subject: Subject) -> tuple[Measured, Found] | None:
+    """The measured target and the first fault, if there is one, of a subclass of DQN, PPO or A2C.
 
     None for other algorithms, and those that do not take the optimizer of their settings.
     """
@@ -47,35 +46,35 @@ def audit_update(subject: Subject) -> tuple[Measured, Found | None] | None:
     found = OfDQN(subject) if issubclass(subject.cls, DQN) else OfActor(subject)
     if type(found.model.policy.optimizer) is not th.optim.SGD:
         return None
-    return found.measured(), next(found.faults(), None)
+    return found.measured(), next(found.faults(), ("", ""))
 
 
 def new_model(subject: ClassSubject, **settings: Any) -> tuple[Any, Copies]:
     """An untrained model with plain gradient descent, and the world with its log."""
     copies = Copies(is_discrete=False)
-    given = {"policy": "MlpPolicy", **subject.typed, "engine": "library", **settings}
-    given |= {"gamma": GAMMA, "seed": 1, "device": "cpu", "env": copies(), "max_grad_norm": 1e9}
+    given = {**subject.typed, "engine": "library", **settings}
+    given |= {"gamma": GAMMA, "seed": 1, "device": "cpu", "max_grad_norm": 1e9}
     given |= {"policy_kwargs": {"net_arch": [32], "optimizer_class": th.optim.SGD}}
     given |= {"learning_rate": lambda progress: progress}
-    known = {name: each for name, each in given.items() if subject.named(name)}
-    model = by_user(subject.cls, **known)
-    model.set_logger(Logger(folder=None, output_formats=[]))
-    return model, copies
+    return by_user(subject.made, copies, given), copies
 
 
 def parameters_of(module: Any) -> Floats:
     """All parameters in one vector, shape (P,)."""
-    found = th.cat([each.detach().flatten() for each in module.parameters()])
-    return np.asarray(found.double().numpy().copy())
+    found = th.nn.utils.parameters_to_vector(module.parameters()).detach()
+    return np.asarray(found.double().numpy())
+
+
+def set_parameters(module: Any, vector: Floats) -> None:
+    """Write a vector of shape (P,) into the parameters."""
+    th.nn.utils.vector_to_parameters(th.as_tensor(vector).float(), module.parameters())
 
 
 def slopes(module: Any, numbers: th.Tensor) -> Floats:
     """The gradients of n numbers by all parameters, shape (n, P)."""
-    rows, all_of_them = [], [*module.parameters()]
+    rows, given = [], [*module.parameters()]
     for number in numbers.flatten():
-        parts = th.autograd.grad(
-            number, all_of_them, retain_graph=True, allow_unused=True, materialize_grads=True
-        )
+        parts = th.autograd.grad(number, given, retain_graph=True, materialize_grads=True)
         rows.append(th.cat([part.flatten() for part in parts]).double().numpy())
     return np.array(rows)
 
@@ -107,43 +106,32 @@ class OfDQN:
         for net in (self.model.q_net, self.model.q_net_target):
             start = parameters_of(net)
             for _ in range(50):  # until it prefers different actions
-                noise = 0.3 * th.randn(start.size).double()
-                vector = th.as_tensor(start) + noise
-                th.nn.utils.vector_to_parameters(vector.float(), net.parameters())
+                set_parameters(net, start + 0.3 * th.randn(start.size).double().numpy())
                 if 0.3 < net(eye).argmax(dim=1).double().mean() < 0.7:
                     break
         values = self.model.q_net(eye)
         self.slopes = slopes(self.model.q_net, values)  # (2 S, P)
         self.q = values.detach().double().numpy()
         self.t = self.model.q_net_target(eye).detach().double().numpy()
-        self.batch, places = self._sampled()
+        # the next value of each state, (S,), by the rules of DQN, double DQN and without a target
+        self.largest, self.online = self.t.max(axis=1), self.q.max(axis=1)
+        self.double = self.t[np.arange(N_STATES), self.q.argmax(axis=1)]
+        buffer = self.model.replay_buffer
+        with patch.object(buffer, "_get_samples", wraps=buffer._get_samples) as asked:
+            self.batch = by_user(buffer.sample, 64)
+        places = asked.call_args.args[0]
         log, newer = Steps(copies.logs[0]), np.where(places < n - 130, places + 130, places)
         self.steps, self.oldest = log.take(newer), log.take(places)
-        self.cells = self.steps.cells(by_action=True)
-
-    def _sampled(self) -> tuple[Any, Ints]:
-        """A batch, and the places of its steps in the memory."""
-        buffer, places = self.model.replay_buffer, []
-        read = buffer._get_samples
-
-        def noted(indices: Any, *rest: Any, **more: Any) -> Any:
-            places.append(indices)
-            return read(indices, *rest, **more)
-
-        buffer._get_samples = noted
-        batch = by_user(buffer.sample, 64)
-        del buffer._get_samples
-        return batch, places[-1]
+        self.cells = self.steps.cells(self.q.size)
 
     def _moved(self, batch: Any) -> Floats:
         """By how much one update moves the parameters, times the steps in it."""
         net, start = self.model.q_net, parameters_of(self.model.q_net)
-        self.model.replay_buffer.sample = lambda *args, **more: batch
         self.model._current_progress_remaining = PROGRESS
-        by_user(self.model.train, 1, 64)
-        del self.model.replay_buffer.sample
+        with patch.object(self.model.replay_buffer, "sample", return_value=batch):
+            by_user(self.model.train, 1, 64)
         moved = parameters_of(net) - start
-        th.nn.utils.vector_to_parameters(th.as_tensor(start).float(), net.parameters())
+        set_parameters(net, start)
         return moved * 64 / PROGRESS
 
     def measured(self) -> Measured:
@@ -155,11 +143,9 @@ class OfDQN:
         per_step[used] = errors / counts
         told, steps = per_step[self.cells], self.steps
         is_clear = (np.abs(told) < 0.98) & (steps.state != 15)  # not clipped, one next state
-        double = self.t[np.arange(N_STATES), self.q.argmax(axis=1)]
-        found = []
-        for values in (self.t.max(axis=1), double, self.q.max(axis=1)):
+        own, found = self.q.ravel()[self.cells], []
+        for values in (self.largest, self.double, self.online):
             reward, *rest = parts_of(steps, values[steps.shown])
-            own = self.q.ravel()[self.cells]
             found.append(fitted(told, [reward / 10, *rest], 50.0 * is_clear, own))
         return min(found, key=lambda each: each.misfit)
 
@@ -186,15 +172,15 @@ class OfDQN:
 
     def _targets(self) -> dict[str, Floats]:
         d, q, t, right = self.steps, self.q, self.t, BACKUPS[RIGHT]
-        largest, online = (next_values(each, d, "largest") for each in (t, q))
         found = {}
         for name, formula in BACKUPS.items():
-            found[name] = formula(d, largest)
-            found[f"{name} (double)"] = formula(d, lambda s: t[s, q[s].argmax(axis=1)])
-        found[f"{RIGHT} (online)" if self.is_online else "target-always-copied"] = right(d, online)
+            found[name] = formula(d, self.largest.take)
+            found[f"{name} (double)"] = formula(d, self.double.take)
+        online = f"{RIGHT} (online)" if self.is_online else "target-always-copied"
+        found[online] = right(d, self.online.take)
         found["double-roles-swapped"] = right(d, lambda s: q[s, t[s].argmax(axis=1)])
-        for rule in RULES.keys() - {"largest", "next", "expected"}:
-            found[name_of_rule(rule)] = right(d, next_values(t, d, rule))
+        for rule in NAMES_OF_RULES.keys() - {"largest", "next", "expected"}:
+            found[NAMES_OF_RULES[rule]] = right(d, next_values(t, d, rule))
         scaled = (d.reward - d.reward.mean()) / d.reward.std(ddof=1)
         found["rewards-normalised"] = found[RIGHT] - d.reward + scaled
         return found
@@ -202,12 +188,10 @@ class OfDQN:
     def _directions(self) -> Iterator[tuple[str, Floats]]:
         """The move of the parameters by each formula and loss."""
         d, q, targets = self.steps, self.q, self._targets()
-        cell, own, one = d.state * 2, self.q.ravel()[self.cells], np.eye(self.q.size)
-        ahead = one[d.shown * 2 + q[d.shown].argmax(axis=1)]
-        residual = one[self.cells] - GAMMA * (1 - d.terminated)[:, None] * ahead
-        online = BACKUPS[RIGHT](d, next_values(q, d, "largest"))
+        cell, one, largest = d.state * 2, np.eye(q.size), q.argmax(axis=1)
+        did = one[self.cells]
         trained = {
-            "trains-the-maximum-not-the-action": one[cell + q[d.state].argmax(axis=1)],
+            "trains-the-maximum-not-the-action": one[cell + largest[d.state]],
             "gather-of-action-0": one[cell],
             "gather-of-action-1": one[cell + 1],
             "gather-of-the-other-action": one[cell + 1 - d.action],
@@ -215,24 +199,24 @@ class OfDQN:
             "action-of-another-step (after)": one[cell + d.next_action],
             "trains-the-mean-of-actions": (one[cell] + one[cell + 1]) / 2,
         }
+        # the name of each, the errors of the steps, and the cells that they move, shape (n, 2 S)
+        rows = []
+        for name, target in targets.items():
+            places = {name: did} | (trained if fault_of(name) == RIGHT else {})
+            rows += [(fault, target - cells @ q.ravel(), cells) for fault, cells in places.items()]
+        own = q.ravel()[self.cells]
+        rows.append(("loss-broadcasts-over-the-batch", targets[RIGHT][:, None] - own, did))
+        online = BACKUPS[RIGHT](d, self.online.take)
+        ahead = GAMMA * d.goes_on[:, None] * one[d.shown * 2 + largest[d.shown]]
+        rows.append(("target-not-detached", online - own, did - ahead))
         for loss, most in (("huber", 1.0), ("mse", np.inf)):
-            for name, target in targets.items():
-                yield (
-                    f"{name} ({loss})",
-                    np.clip(target - own, -most, most) @ self.slopes[self.cells],
-                )
-                if fault_of(name) == RIGHT:
-                    for fault, place in trained.items():
-                        errors = np.clip(target - place @ q.ravel(), -most, most)
-                        yield f"{fault} ({loss})", errors @ place @ self.slopes
-            every = np.clip(targets[RIGHT][:, None] - own, -most, most).mean(axis=0)
-            yield f"loss-broadcasts-over-the-batch ({loss})", every @ self.slopes[self.cells]
-            errors = np.clip(online - own, -most, most)
-            yield f"target-not-detached ({loss})", errors @ residual @ self.slopes
-        old, places = self.oldest, self.oldest.cells(by_action=True)
-        errors = BACKUPS[RIGHT](old, next_values(self.t, old, "largest")) - q.ravel()[places]
-        yield "stale-buffer", np.clip(errors, -1, 1) @ self.slopes[places]
-        yield f"{RIGHT} (absolute)", np.sign(targets[RIGHT] - own) @ self.slopes[self.cells]
+            for name, errors, cells in rows:
+                mean = np.atleast_2d(np.clip(errors, -most, most)).mean(axis=0)
+                yield f"{name} ({loss})", mean @ cells @ self.slopes
+        old, old_cells = self.oldest, self.oldest.cells(q.size)
+        errors = BACKUPS[RIGHT](old, self.largest.take) - q.ravel()[old_cells]
+        yield "stale-buffer", np.clip(errors, -1, 1) @ self.slopes[old_cells]
+        yield f"{RIGHT} (absolute)", np.sign(targets[RIGHT] - own) @ did @ self.slopes
 
     def _copied(self) -> Iterator[Found]:
         """Whether the target network is copied when it should be, and mixed as it should be."""
@@ -241,8 +225,7 @@ class OfDQN:
         model, _ = new_model(self.subject, target_update_interval=1, tau=TAU, learning_starts=10)
         by_user(model.learn, 5)  # nothing is learnt yet: the networks are the same
         before = parameters_of(model.q_net_target)
-        one_more = th.as_tensor(before + 1).float()
-        th.nn.utils.vector_to_parameters(one_more, model.q_net.parameters())
+        set_parameters(model.q_net, before + 1)
         by_user(model._on_step)
         moved = float(np.abs(parameters_of(model.q_net_target) - before).mean())
         if min(abs(moved - each) for each in (TAU, 0, 1)) > 1e-3:  # some always copy all of it
@@ -269,8 +252,9 @@ class OfDQN:
 
         by_user(model.learn, 45, callback=note)
         changes = [(old, new) for old, new in pairwise(seen) if (old[1] != new[1]).any()]
-        copies = [(new[1] == net).all() for old, new in changes for net in (old[0], new[0])]
-        n_copies = int(np.reshape(copies, (-1, 2)).any(axis=1).sum())
+        n_copies = sum(
+            any((new[1] == net).all() for net in (old[0], new[0])) for old, new in changes
+        )
         return n_copies, len(changes) - n_copies
 
     def _explored(self) -> Iterator[Found]:
@@ -300,15 +284,13 @@ class OfActor:
         with th.no_grad():
             for each in self.policy.parameters():
                 each.add_(0.3 * th.randn_like(each))
-        self.model.train = lambda: None
-        by_user(self.model.learn, n)
-        del self.model.train
+        with patch.object(self.model, "train"):
+            by_user(self.model.learn, n)
         self.steps = d = Steps(copies.logs[0][:n])
         d.next_state[-1] = d.shown[-1]
         buffer = self.model.rollout_buffer
-        self.advantages, self.returns = (
-            each[:, 0].astype(float) for each in (buffer.advantages, buffer.returns)
-        )
+        self.advantages = buffer.advantages[:, 0].astype(float)
+        self.returns = buffer.returns[:, 0].astype(float)
         with th.no_grad():
             told = self.policy.predict_values(th.eye(N_STATES))[:, 0]
         self.v: Floats = np.asarray(told.double().numpy())
@@ -345,9 +327,9 @@ class OfActor:
         d, found = self.steps, dict[str, Floats]()
         on, fade, v = 1 - d.over, GAMMA * self.decay, next_values(self.v[:, None], d, "")
         keeps = {
-            "": fade * on,
+            RIGHT: fade * on,
             "trace-leaks-into-the-next-episode": fade * (on + d.over),
-            "trace-leaks-at-truncation": fade * (1 - d.terminated),
+            "trace-leaks-at-truncation": fade * d.goes_on,
             "done-flag-off-by-one": fade * (1 - d.is_first),
             "lambda-missing": GAMMA * on,
             "lambda-zero": 0 * on,
@@ -363,8 +345,7 @@ class OfActor:
                 errors, total = target - self.v[d.state], np.zeros(self.n + 1)
                 for k in reversed(range(self.n)):
                     total[k] = errors[k] + keep[k] * total[k + 1]
-                label = name if not kept else kept if name == RIGHT else f"{name} ({kept})"
-                found[label] = total[:-1]
+                found[kept if name == RIGHT else f"{name} ({kept})"] = total[:-1]
         right = found[RIGHT]
         found["advantage-sign"] = -right
         found[NORMALISED] = (right - right.mean()) / right.std()
@@ -449,16 +430,12 @@ class OfActor:
 
     def _minibatches(self) -> Iterator[Found]:
         model, _ = new_model(self.subject, n_steps=96, batch_size=32, n_epochs=3)
-        seen, evaluate = list[bytes](), model.policy.evaluate_actions
-
-        def noted(observations: Any, actions: Any) -> Any:
-            seen.append(observations.numpy().tobytes() + actions.numpy().tobytes())
-            return evaluate(observations, actions)
-
-        model.policy.evaluate_actions = noted
-        by_user(model.learn, 96)
-        if (len(set(seen)), len(seen)) != (9, 9):
-            told = (
-                f"{len(set(seen))} different minibatches in {len(seen)} updates; right would be 9"
-            )
-            yield "minibatches-reused" if len(seen) == 9 else "minibatches-or-epochs", told
+        policy = model.policy
+        with patch.object(policy, "evaluate_actions", wraps=policy.evaluate_actions) as asked:
+            by_user(model.learn, 96)
+        batches = [call.args for call in asked.call_args_list]
+        n_different = len({b"".join(each.numpy().tobytes() for each in one) for one in batches})
+        n = len(batches)
+        if (n_different, n) != (9, 9):
+            told = f"{n_different} different minibatches in {n} updates; right would be 9"
+            yield "minibatches-reused" if n == 9 else "minibatches-or-epochs", told

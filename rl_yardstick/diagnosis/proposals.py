@@ -10,15 +10,17 @@ settings differ from the shipped ones, the second proposal is all of these at on
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import bdtr
 
 from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.planning import PlanningAgent, RandomAgent
 from rl_yardstick.agents.policies import is_network
 from rl_yardstick.envs.known_models import time_limit
@@ -30,20 +32,19 @@ from rl_yardstick.mdp import (
     state_visitation,
 )
 from rl_yardstick.mdp.transition_model import Floats, Ints
-from rl_yardstick.pipeline.components import constructor_parameters
+from rl_yardstick.pipeline.components import constructor_parameters, schedule
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
-from rl_yardstick.pipeline.settings import entry_names, literal, shipped_hyperparams
+from rl_yardstick.pipeline.settings import BUDGETS, entry_names, literal, shipped_hyperparams
 from rl_yardstick.pipeline.spec import TrainSpec
 
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.explanation import Found, Part, Task
 
-STEPS, EPISODES = "n_timesteps", "n_episodes"
+STEPS, EPISODES = BUDGETS
 VARIANT = ("train_env_kwargs", "train_env_wrapper")
-FIRST, LAST, FRACTION, DECAY = EXPLORATION = (
-    *("exploration_initial_eps", "exploration_final_eps"),
-    *("exploration_fraction", "exploration_decay"),
-)
+FIRST, LAST = "exploration_initial_eps", "exploration_final_eps"
+FRACTION, DECAY = "exploration_fraction", "exploration_decay"
+EXPLORATION = (FIRST, LAST, FRACTION, DECAY)
 # Settings with a rule of their own, and settings that are no cause.
 _WITH_RULE = {*EXPLORATION, "gamma", "learning_rate", "initial_q", "policy_kwargs"}
 _NO_CAUSE = {"policy", "engine", "mask_actions", "seed", "device", "verbose"}
@@ -143,8 +144,8 @@ class _Case:
             self.limit = time_limit(env) or found.horizon
         # the best actions for the agent's own objective, and the share of each state in their
         # steps, shape (S,); 0 where they are unknown
-        is_known = found.own_values is not None and found.groups is None
-        values = found.split.action_values if found.own_values is None else found.own_values
+        is_known = found.task is not None and found.groups is None
+        values = found.split.action_values if found.task is None else found.task.own_values
         self.best: Ints = values.argmax(axis=1)
         visits = state_visitation(found.model, self.best, found.horizon)
         self.path: Floats = visits / visits.sum() * is_known
@@ -197,12 +198,9 @@ class _Case:
     def _far_off(self) -> dict[str, float]:
         """The distances of the settings that are far from the shipped ones, the largest first."""
         found = {key: self._away(key) for key in self.known | _AROUND}
-        far = {
-            key: away
-            for key, away in found.items()
-            if abs(away) > DIFFERENT and (away < 0 or key not in _HARMLESS_ABOVE)
-        }
-        return dict(sorted(far.items(), key=lambda one: (-abs(one[1]), one[0])))
+        far = [(key, away) for key, away in found.items() if abs(away) > DIFFERENT]
+        far = [(key, away) for key, away in far if away < 0 or key not in _HARMLESS_ABOVE]
+        return dict(sorted(far, key=lambda one: (-abs(one[1]), one[0])))
 
     def _away(self, key: str) -> float:
         """How far a setting lies above (+) or below (-) the shipped one."""
@@ -215,19 +213,17 @@ class _Case:
     def _objective(self) -> Iterator[_Change]:
         """Training on the task as it is, another discount, other initial values."""
         own, found, task = self.own, self.found, self.found.task
-        values, before = found.own_values, found.for_discount
-        differs = {VARIANT[0]: bool(training_changes(self.spec)), VARIANT[1]: True}
-        changed = [key for key in VARIANT if own.get(key) and differs[key]]
+        changed = [key for key in VARIANT if own.get(key) and training_changes(self.spec)]
         share = 0.0
-        if changed and task is not None and before is not None:
-            share = self._gain(found.model, task.discount, before)
+        if changed and task is not None:
+            share = self._gain(found.model, task.discount, task.for_discount)
         if odd := [key for key in VARIANT if key in self.odd]:
             change = {key: self.usual.get(key) for key in odd}
             yield change, len(odd) + 8 * self.out_of_reach, share
         if kept := [key for key in changed if key not in odd]:
             weight = 0.1 * self.is_network + 8 * self.out_of_reach
             yield dict.fromkeys(kept), weight, 0.0 if odd else share
-        if task is None or values is None:
+        if task is None:
             return
         nearer = round(1 - 0.5 / found.horizon, 7)
         if self.odd.get("gamma", 0.0) > 0:
@@ -235,13 +231,13 @@ class _Case:
         if "gamma" in self.known and task.discount < nearer:
             # An agent that explores too much, or lacks steps, may value the start so as well.
             away = max(-self._away("gamma"), 0.0)
-            own_start, best_start = self._standing_still(task, values)
+            own_start, best_start = self._standing_still(task)
             stands = STANDS_STILL[0] <= own_start <= STANDS_STILL[1] and best_start > HARDLY_MORE
             stands = stands and ("gamma" in self.odd or not self.is_entry)
             weight = 4.0 * stands + 0.15 * away
-            yield {"gamma": "auto"}, weight, self._gain(task.lived, nearer, values)
+            yield {"gamma": "auto"}, weight, self._gain(task.lived, nearer, task.own_values)
         if "initial_q" in self.known:
-            best = values.max(axis=1)[task.model.reachable]
+            best = task.own_values.max(axis=1)[task.model.reachable]
             usual, high = self.usual["initial_q"], float(f"{best.max():.3g}")
             high = usual if usual > own["initial_q"] else high
             # Values below all true ones hide every action that was not tried.
@@ -255,20 +251,18 @@ class _Case:
             if above > 1 and usual < own["initial_q"]:
                 yield {"initial_q": usual}, min(above, 4.0), 0.0
 
-    def _standing_still(self, task: Task, best: Floats) -> tuple[float, float]:
+    def _standing_still(self, task: Task) -> tuple[float, float]:
         """Its start value, and the best, divided by that of standing still; 0 if unknown."""
-        model, tables = task.model, getattr(self.found.agent.policy, "q_tables", None)
-        stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated
-        stays &= (model.prob > 0) & model.reachable[:, None, None]
-        observations = self.found.evaluator.observations
-        if tables is None or not stays.any() or task.discount >= 1 or observations.ndim != 1:
+        model, own, policy = task.model, self.found.beliefs, self.found.agent.policy
+        own_state = np.arange(model.n_states)[:, None, None]
+        stays = model.goes_on & (model.next_state == own_state) & model.reachable[:, None, None]
+        if own is None or not hasattr(policy, "q_tables") or not stays.any() or task.discount >= 1:
             return 0.0, 0.0
         standing = float(model.reward[stays].max()) / (1 - task.discount)
         if standing >= 0:
             return 0.0, 0.0
-        own = tables.numpy().mean(axis=0)[observations]
-        own_start, best_start = (float(model.initial @ q.max(axis=1)) for q in (own, best))
-        return own_start / standing, best_start / standing
+        starts = [float(model.initial @ q.max(axis=1)) for q in (own, task.own_values)]
+        return starts[0] / standing, starts[1] / standing
 
     def _gain(self, model: TransitionModel, discount: float, before: Floats) -> float:
         """The share of the gap that planning with another model or discount closes."""
@@ -308,9 +302,8 @@ class _Case:
         key, away = "learning_rate", self._away("learning_rate")
         own, usual = self.own[key], self.usual[key]
         more = max(-away, 0.0)
-        larger = (
-            usual if more > DIFFERENT else _scaled(own, FACTOR, np.inf if self.is_network else 1)
-        )
+        most = np.inf if self.is_network else 1.0
+        larger = usual if more > DIFFERENT else _scaled(own, FACTOR, most)
         # A table that lacks steps or exploration learns no more with larger ones.
         base = 2 * self.unlearnt * (1 - self.starved) * (not self.is_blind) / (1 + 4 * self.short)
         base = 0.2 if self.is_network else base
@@ -319,11 +312,8 @@ class _Case:
         if self.is_network and more < DIFFERENT:
             smaller = usual if away > DIFFERENT else _scaled(own, 1 / FACTOR)
             yield {key: smaller}, 0.3 + 0.7 * max(away, 0.0), 0.0
-        elif (
-            not self.is_network
-            and rates[-1] > 0
-            and (self.has_errors or self.lost.get("exploring"))
-        ):
+        is_noisy = self.has_errors or self.lost.get("exploring")
+        if not self.is_network and rates[-1] > 0 and is_noisy:
             ends, falls = _course(usual), f"exp_{rates.max():.2g}_{rates[-1] / 10:.2g}"
             lower = np.log(rates[-1] / ends[-1]) if ends is not None and ends[-1] > 0 else 0.0
             settled = (1 - self.unlearnt) * (1 - self.starved) * min(10 * rates[-1], 1.0)
@@ -333,9 +323,8 @@ class _Case:
     def _exploration(self) -> Iterator[_Change]:
         """More exploration and less, by epsilon, a temperature, noise or a bonus for entropy."""
         own, kind = self.own, self.own.get("exploration")
-        is_used = {"ent_coef": True, "temperature": kind == "boltzmann"}
-        for key in (key for key in is_used if is_used[key] and key in self.known):
-            if isinstance(own[key], int | float):
+        for key, is_used in (("ent_coef", True), ("temperature", kind == "boltzmann")):
+            if is_used and key in self.known and isinstance(own[key], int | float):
                 away = self._away(key)
                 more = self.usual[key] if away < -DIFFERENT else FACTOR * own[key] or 0.02
                 yield {key: more}, 3 * self.starved + max(-away, 0.0), 0.0
@@ -364,22 +353,20 @@ class _Case:
 
     def _epsilons(self, change: Mapping[str, Any]) -> Floats | None:
         """Epsilon at some moments of the training; None for agents without it."""
-        settings = {**self.own, **change}
-        is_used = settings.get("exploration", "epsilon_greedy") == "epsilon_greedy"
-        if FIRST not in self.known or not is_used:
+        settings = {DECAY: "linear", **self.own, **change}
+        if (
+            FIRST not in self.known
+            or settings.get("exploration", "epsilon_greedy") != "epsilon_greedy"
+        ):
             return None
-        first, last, share = (float(settings[key]) for key in EXPLORATION[:3])
-        decay, passed = settings.get(DECAY), np.minimum(MOMENTS / max(share, TIE), 1)
-        if decay == "exponential":
-            return np.asarray(first * (last / first) ** passed)
-        return np.asarray(first + (decay != "constant") * passed * (last - first))
+        return _at_moments(epsilon_schedule(SimpleNamespace(**settings)))
 
     # --- what was tried ---------------------------------------------------------------------------
 
     def _chance_out_of_reach(self) -> float:
         """The share of best episodes that meet states beyond the time limit of training."""
         model = self.model
-        here, goes = model.initial > 0, (model.prob > 0) & ~model.terminated
+        here, goes = model.initial > 0, model.goes_on
         for _ in range(min(self.limit, model.n_states) - 1):
             here[model.next_state[here][goes[here]]] = True
         meets = ~here[model.next_state] & goes
@@ -409,13 +396,14 @@ class _Case:
         return float(self.path @ (1 - np.minimum(updates / ENOUGH, 1)))
 
 
+def _at_moments(course: Callable[[float], float]) -> Floats:
+    return np.array([course(1 - moment) for moment in MOMENTS])
+
+
 def _course(value: Any) -> Floats | None:
     """A number or a schedule at some moments of the training; None for other values."""
-    if isinstance(value, str) and value[:4] in ("lin_", "exp_"):
-        first, last = [*map(float, value[4:].split("_")), 0.0][:2]
-        is_linear = value.startswith("lin_")
-        share = MOMENTS * (last - first) if is_linear else (last / first) ** MOMENTS
-        return np.asarray(first + share if is_linear else first * share)
+    if isinstance(value, str) and value.startswith(("lin_", "exp_")):
+        return _at_moments(schedule(value, for_library=False))
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return np.full(len(MOMENTS), float(value)) if is_number else None
 

@@ -7,6 +7,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from rl_yardstick.pipeline.errors import UserError, one_line, unknown
 from rl_yardstick.pipeline.spec import validated
 
 SpaceKind = Literal["discrete", "box"]  # of observations
+Settings = Mapping[str, Any]
 
 # What an algorithm claims to be, and its next value: a rule of `backups`, or that of states.
 KINDS: Mapping[str, str] = {
@@ -40,8 +42,6 @@ _KIND_WORDS = {
     "q_learning": r"q[ _-]?(learning|network|lambda)|dqn|qlearn",
     "actor_critic": r"actor[ _-]?critic|a2c|ppo|reinforce|policy[ _-]gradient",
 }
-
-
 _LONGER = r"monte[ _-]?carlo|lambda|trace|n[ _-]?step"  # words of learners that look far ahead
 
 
@@ -80,7 +80,7 @@ class Subject(ABC):
     """An algorithm under audit."""
 
     kind: str | None = None  # one of `KINDS`; None if it is not known
-    typed: Mapping[str, Any]  # settings that the user gave
+    typed: Settings  # settings that the user gave
     parameters: Mapping[str, inspect.Parameter]
     observes: SpaceKind  # the kind of observations
     kinds: Sequence[SpaceKind] = ("box", "discrete")  # that are tried, in this order
@@ -91,7 +91,7 @@ class Subject(ABC):
         self.is_one_step = not re.search(_LONGER, f"{name} {kind} {doc}", re.I)
 
     @abstractmethod
-    def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
+    def run(self, make_env: Copies, seed: int, steps: int, changes: Settings) -> Any:
         """A model that is trained, with ``predict``."""
 
     def train(self, steps: int, seed: int, bump: int = -1, **changes: Any) -> Trained:
@@ -128,34 +128,25 @@ class Subject(ABC):
                 return
             except CannotTrain as error:
                 errors.append(str(error))
-        raise UserError(
-            f"{self.name} cannot train on a tiny world: {'; '.join(dict.fromkeys(errors))} "
-            "(--observations sets their kind)"
-        )
+        told = f"{'; '.join(dict.fromkeys(errors))} (--observations sets their kind)"
+        raise UserError(f"{self.name} cannot train on a tiny world: {told}")
 
 
 # --- classes --------------------------------------------------------------------------------------
 
 # Families of the library and of ours: what they claim to be, and settings under which they learn
-# this world in few steps.
-_NET: Mapping[str, Any] = {"policy_kwargs": {"net_arch": [32]}}
-_OFF_POLICY: Mapping[str, Any] = {
+# this world in few steps. Settings that a class does not have are left out.
+_NETWORK: Settings = {
     "learning_rate": 3e-3,
     "buffer_size": 4000,
     "learning_starts": 100,
     "batch_size": 64,
     "train_freq": 2,
     "target_update_interval": 50,
-    **_NET,
-}
-_ON_POLICY: Mapping[str, Any] = {
-    "learning_rate": 3e-3,
-    "n_steps": 128,
-    "batch_size": 64,
     "n_epochs": 10,
-    "policy_kwargs": {"net_arch": {"pi": [32], "vf": [32]}},
+    "policy_kwargs": {"net_arch": [32]},
 }
-_FAMILIES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+_FAMILIES: Mapping[str, tuple[str, Settings]] = {
     **dict.fromkeys(("NStepTreeBackup", "ExpectedSARSA"), ("expected_sarsa", {})),
     **dict.fromkeys(("NStepSARSA", "SARSALambda", "SARSA", "SemiGradientSARSA"), ("sarsa", {})),
     "MonteCarlo": ("sarsa", {"learning_rate": 0.1}),
@@ -164,14 +155,11 @@ _FAMILIES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "SemiGradientQ": ("q_learning", {}),
     "ActorCritic": ("actor_critic", {}),
     "Reinforce": ("actor_critic", {"baseline": "value"}),
-    "QRDQN": (
-        "q_learning",
-        {**_OFF_POLICY, "policy_kwargs": {"net_arch": [32], "n_quantiles": 10}},
-    ),
-    "DQN": ("q_learning", _OFF_POLICY),
-    "OnPolicyAlgorithm": ("actor_critic", _ON_POLICY),
+    "QRDQN": ("q_learning", {**_NETWORK, "policy_kwargs": {"net_arch": [32], "n_quantiles": 10}}),
+    "DQN": ("q_learning", _NETWORK),
+    "OnPolicyAlgorithm": ("actor_critic", {**_NETWORK, "n_steps": 128}),
 }
-_EXPLORES = {"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0}
+_EXPLORES: Settings = {"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0}
 
 
 class ClassSubject(Subject):
@@ -182,11 +170,7 @@ class ClassSubject(Subject):
     """
 
     def __init__(
-        self,
-        name: str,
-        typed: Mapping[str, Any],
-        kind: str | None = None,
-        wanted: SpaceKind | None = None,
+        self, name: str, typed: Settings, kind: str | None = None, wanted: SpaceKind | None = None
     ) -> None:
         cls: Any = load_algorithm(name)
         plain = getattr(cls, "plain", None)
@@ -203,27 +187,31 @@ class ClassSubject(Subject):
         for key in typed:
             if key not in known:
                 raise unknown(f"{name} has no hyperparameter", key, known)
-        ancestors = [ancestor.__name__ for ancestor in self.cls.__mro__]
-        family = next((each for each in ancestors if each in _FAMILIES), "")
-        claims, settings = _FAMILIES.get(family, (None, {}))
-        told = kind_of(name.rpartition(".")[2], doc)
-        self.kind, self.base = kind or claims or told, {**_EXPLORES, **settings}
+        ancestors = [ancestor.__name__ for ancestor in cls.__mro__]
+        families = (_FAMILIES[each] for each in ancestors if each in _FAMILIES)
+        claims, settings = next(families, (None, {}))
+        self.kind = kind or claims or kind_of(name.rpartition(".")[2], doc)
+        self.base = {**_EXPLORES, **settings}
         if plain is None:
             self.kinds = ("discrete", "box")
         arguments = check_arguments(name, typed)
         spec = validated({"algo": name, "env_id": "", "algorithm": arguments})
-        self.typed = constructor_arguments(spec, self.cls, is_dict=False)
+        self.typed = constructor_arguments(spec, cls, is_dict=False)
         self.find_observations(wanted)
 
-    def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
+    def run(self, make_env: Copies, seed: int, steps: int, changes: Settings) -> Any:
+        wanted = {**self.base, "gamma": GAMMA, "seed": seed, "device": "cpu"}
+        model = self.made(make_env, {**wanted, **self.typed, **changes})
+        model.learn(steps)
+        return model
+
+    def made(self, make_env: Copies, wanted: Settings) -> Any:
+        """An untrained model, with those of the settings that its class has."""
         from stable_baselines3.common.logger import Logger
 
-        wanted = {**self.base, "gamma": GAMMA, "seed": seed, "device": "cpu"}
-        wanted |= {**self.typed, **changes}
         settings = {name: deepcopy(each) for name, each in wanted.items() if self.named(name)}
         model = self.cls(env=make_env(), **settings)
         model.set_logger(Logger(folder=None, output_formats=[]))
-        model.learn(steps)
         return model
 
 
@@ -256,7 +244,7 @@ class ScriptSubject(Subject):
         self,
         name: str,
         function: Callable[..., Any],
-        typed: Mapping[str, Any],
+        typed: Settings,
         kind: str | None = None,
         wanted: SpaceKind | None = None,
     ) -> None:
@@ -271,28 +259,20 @@ class ScriptSubject(Subject):
         takes_any = any(p.kind is p.VAR_KEYWORD for p in self.parameters.values())
         missing = [each for each in _NEEDED if not (takes_any or self.named(each))]
         if missing:
-            raise UserError(
-                f"{name} must take {', '.join(_NEEDED)}: {', '.join(missing)} is missing"
-            )
+            told = f"{', '.join(_NEEDED)}: {', '.join(missing)} is missing"
+            raise UserError(f"{name} must take {told}")
         for key in typed:
             if not self.named(key):
                 raise unknown(f"-params: unknown argument of {name}", key, self.parameters)
         self.find_observations(wanted)
 
-    def run(self, make_env: Copies, seed: int, steps: int, changes: Mapping[str, Any]) -> Any:
+    def run(self, make_env: Copies, seed: int, steps: int, changes: Settings) -> Any:
         settings: Any = {"seed": seed, "gamma": GAMMA, **deepcopy(dict(self.typed)), **changes}
         agent = self.function(make_env=make_env, steps=steps, **settings)
         if not callable(getattr(agent, "act", None)):
             raise UserError("a script's function must return something with act(obs)")
-        return ScriptModel(agent)
 
+        def predict(observation: Any, **_: Any) -> tuple[Any, None]:
+            return agent.act(observation if observation.ndim else int(observation)), None
 
-class ScriptModel:
-    """What a function trains, asked as the library's models are."""
-
-    def __init__(self, agent: Any) -> None:
-        self.agent, self.values = agent, getattr(agent, "values", None)
-
-    def predict(self, observation: Any, **_: Any) -> tuple[Any, None]:
-        """The action at an observation."""
-        return self.agent.act(observation if observation.ndim else int(observation)), None
+        return SimpleNamespace(predict=predict, values=getattr(agent, "values", None))
