@@ -4,7 +4,7 @@ import pytest
 
 from rl_yardstick.diagnosis.audit import audit
 from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject
-from rl_yardstick.pipeline.components import agent_name, import_modules
+from rl_yardstick.pipeline.components import class_name, import_modules
 from tests.diagnosis.planted import FAULTS, PROGRAMS, text_of
 
 # Rows of networks in scripts take half a minute; benchmarks/audit_faults.py has them.
@@ -25,7 +25,7 @@ def verdict_on(tmp_path):
             exec(path.read_text(), inside)  # noqa: S102
             return audit(ScriptSubject(name, inside[name], {}), seeds=1)
         import_modules([f"{path}:{name}"])
-        return audit(ClassSubject(agent_name(f"{path}:{name}"), {}), seeds=1)
+        return audit(ClassSubject(class_name(f"{path}:{name}"), {}), seeds=1)
 
     return on
 
