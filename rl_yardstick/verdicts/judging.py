@@ -287,13 +287,11 @@ def _best(agents: Sequence[AgentRuns], pairs: Sequence[Pair], against: str) -> B
     n_pairs = len(names) * (len(names) - 1) // 2
     is_tied = len(among) == n_pairs > 0 and all(pair.word == "tied" for pair in among)
     leads = [pair for pair in said if pair.first in names and pair.word in ("better", "tied")]
-    so_far = any(pair.so_far for pair in leads)
     # Where all are compared with one agent alone, more seeds would not tell them apart.
-    how = {pair.word for pair in said if pair.first in names and pair.second == against}
-    if not how or "undecided" in how:
-        return Best(tuple(names), is_tied, so_far)
-    relation = " or ".join({"better": "better than", "tied": "tied with"}[w] for w in sorted(how))
-    return Best(tuple(names), is_tied, so_far, f"{relation} {against}")
+    how = sorted({pair.word for pair in said if pair.first in names and pair.second == against})
+    relation = " or ".join(how).replace("better", "better than").replace("tied", "tied with")
+    otherwise = f"{relation} {against}" if how and "undecided" not in how else "undecided"
+    return Best(tuple(names), is_tied, any(pair.so_far for pair in leads), otherwise)
 
 
 def _grown(rules: _Rules, scores: Scores, looks: Sequence[int]) -> Study:
