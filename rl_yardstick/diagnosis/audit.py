@@ -75,17 +75,23 @@ def audit(subject: Subject, seeds: int = 0) -> Verdict:
     """Audit an algorithm.
 
     A subclass of the library's DQN, PPO or A2C is asked for one update, which is compared exactly.
-    All else is trained in the composite world, with each of ``seeds`` seeds (default: 3 for a
-    table, 2 for a network), and its values are compared with those to which each formula leads.
+    All else, and a subclass whose update is like no formula's, is trained in the composite world,
+    with each of ``seeds`` seeds (default: 3 for a table, 2 for a network), and its values are
+    compared with those to which each formula leads.
     """
     from rl_yardstick.diagnosis.one_update import audit_update
 
     try:
         with warnings.catch_warnings():  # of the program that is audited
             warnings.simplefilter("ignore")
-            if (found := audit_update(subject)) is None:
+            found = audit_update(subject)
+            if found is None:
                 return _ByValues(subject, seeds).verdict()
-        told, (fault, note) = found
+            told, (fault, note) = found
+            if note and not fault:  # perhaps it learns by a rule of its own
+                by_values = _ByValues(subject, seeds, has_own_rule=True).verdict()
+                if by_values.state == "right":
+                    return replace(by_values, notes=(f"{note}; what it learns is right",))
         state: State = "wrong" if note else "right"
         return Verdict(subject.name, state, fault, told.words(), (note,) * bool(note), "", told)
     except CannotTrain as error:
@@ -144,6 +150,7 @@ class _ByValues:
 
     subject: Subject
     n_seeds: int = 0
+    has_own_rule: bool = False  # then settings need not mean what their names say
 
     def verdict(self) -> Verdict:
         """Train longer until the values have settled, and compare them."""
@@ -192,6 +199,8 @@ class _ByValues:
         one = trainings[-1]
         backup = measured(one.values, one.steps, rule)
         verdict = partial(Verdict, self.subject.name, target=backup.words(), measured=backup)
+        if all((each.values == each.first).all() for each in trainings):
+            return verdict("wrong", "does-not-learn", notes=("its values stay as they were",))
         if right.rms <= 0.5 and right.worst <= 3 and right.rms <= near[0].rms + 0.1:
             for fault, note in self._other_faults(trainings, rule):
                 return verdict("wrong", fault, notes=(note,))
@@ -199,13 +208,15 @@ class _ByValues:
             return verdict("right", unseen="" if self.is_table else unseen)
         tight = 0.25 if self.is_table else 0.5
         is_tight = near[0].rms <= tight and near[0].worst <= 4 * tight
-        fault = fault_of(near[0].name)
-        other = next(each for each in near if fault_of(each.name) != fault)
-        told = [f"{fault_of(each.name)} at {each.rms:.2f}" for each in (near[0], other)]
-        note = f"nearest in tolerances: {told[0]}, {told[1]}; right at {right.rms:.2f}"
+        alike = {fault_of(each.name): 0 for each in near if each.rms < near[0].rms + 0.02}
+        fault = " or ".join(alike)  # values that cannot be told apart
+        other = next(each for each in near if fault_of(each.name) not in alike)
+        told = f"{fault} at {near[0].rms:.2f}, {fault_of(other.name)} at {other.rms:.2f}"
+        note = f"nearest in tolerances: {told}; right at {right.rms:.2f}"
         if fault == RIGHT and not any(backup.off()):  # it is too noisy, or learns too slowly
             return verdict("unreadable", notes=(note,))
-        is_named = is_tight and other.rms > 1.9 * near[0].rms and fault != RIGHT
+        is_named = is_tight and other.rms > 1.9 * near[0].rms and RIGHT not in alike
+        is_named &= len(alike) < 3
         is_named &= self.subject.is_one_step or not fault.startswith(OF_ONE_STEP)
         return verdict("wrong", fault if is_named else "", notes=(note,))
 
@@ -214,8 +225,9 @@ class _ByValues:
         yield from _choices(trainings)
         if self.is_table:
             yield from _credit(self.subject)
-        with suppress(CannotTrain):  # it may not be made for other settings
-            yield from self._with_other_settings(rule)
+        if not self.has_own_rule:
+            with suppress(CannotTrain):  # it may not be made for other settings
+                yield from self._with_other_settings(rule)
 
     def _with_other_settings(self, rule: str) -> Iterator[Found]:
         """What it does without exploration, and with rollouts of two steps, if it has settings."""
@@ -259,6 +271,8 @@ def _choices(trainings: Sequence[_Training]) -> Iterator[Found]:
     low, high = min(asked), max(asked)
     if low <= 0.99:
         fault = "acts-by-the-worst-value" if high < 0.03 else "explores-in-evaluation"
+        if {*asked} <= {0.0, 1.0} and high:
+            fault = ""  # it is wrong in some states, and explores in none
         shares = f"{low:.0%} to {high:.0%} of 200 times"
         yield fault, f"it does the action that pays in {shares}, when evaluated"
 

@@ -178,6 +178,9 @@ class OfDQN:
             found[f"{name} (double)"] = formula(d, self.double.take)
         online = f"{RIGHT} (online)" if self.is_online else "target-always-copied"
         found[online] = right(d, self.online.take)
+        found["next-value-is-best-in-own-state (double)"] = right(
+            d, lambda s: t[s, q[d.state].argmax(axis=1)]
+        )
         found["double-roles-swapped"] = right(d, lambda s: q[s, t[s].argmax(axis=1)])
         for rule in NAMES_OF_RULES.keys() - {"largest", "next", "expected"}:
             found[NAMES_OF_RULES[rule]] = right(d, next_values(t, d, rule))
@@ -227,9 +230,12 @@ class OfDQN:
         before = parameters_of(model.q_net_target)
         set_parameters(model.q_net, before + 1)
         by_user(model._on_step)
-        moved = float(np.abs(parameters_of(model.q_net_target) - before).mean())
-        if min(abs(moved - each) for each in (TAU, 0, 1)) > 1e-3:  # some always copy all of it
-            yield "target-mixed-wrongly", f"the target network moves by {moved:.3g}, tau is {TAU}"
+        moved = parameters_of(model.q_net_target) - before
+        low, high = float(moved.min()), float(moved.max())
+        is_turned = abs(low - (1 - TAU)) < 1e-3  # others may mix by a rate of their own
+        if is_turned or low < -1e-3 or high > 1.001 or high - low > 1e-3:
+            told = f"the target network moves by {low:.3g} to {high:.3g}, tau is {TAU}"
+            yield "target-mixed-wrongly", told
         right = range(3, 5)  # copies of a network that learns from the 11th step on, in 45 steps
         for interval, wanted in ((10, right), (10**9, range(1))):
             copies, others = self._changes_of_target(interval)

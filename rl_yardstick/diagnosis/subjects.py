@@ -54,6 +54,11 @@ def kind_of(*texts: str | None) -> str | None:
     return None
 
 
+def docs_of_module(thing: Any) -> str:
+    """The docstring of the module that defines a class or function."""
+    return getattr(inspect.getmodule(thing), "__doc__", None) or ""
+
+
 class CannotTrain(Exception):  # noqa: N818 (a finding)
     """What the audited program raised, in a line."""
 
@@ -174,8 +179,8 @@ class ClassSubject(Subject):
     ) -> None:
         cls: Any = load_algorithm(name)
         plain = getattr(cls, "plain", None)
-        doc = inspect.getdoc(plain or cls) or ""
-        super().__init__(name, kind, doc)
+        docs = inspect.getdoc(plain or cls) or "", docs_of_module(plain) if plain else ""
+        super().__init__(name, kind, " ".join(docs))
         if ALGORITHMS[name].for_bandits:
             raise UserError(f"--algo {name}: it is for bandits, and this world has states")
         if ALGORITHMS[name].family in ("planning", "reference"):
@@ -190,7 +195,7 @@ class ClassSubject(Subject):
         ancestors = [ancestor.__name__ for ancestor in cls.__mro__]
         families = (_FAMILIES[each] for each in ancestors if each in _FAMILIES)
         claims, settings = next(families, (None, {}))
-        self.kind = kind or claims or kind_of(name.rpartition(".")[2], doc)
+        self.kind = kind or claims or kind_of(name.rpartition(".")[2], *docs)
         self.base = {**_EXPLORES, **settings}
         if plain is None:
             self.kinds = ("discrete", "box")
@@ -248,8 +253,7 @@ class ScriptSubject(Subject):
         kind: str | None = None,
         wanted: SpaceKind | None = None,
     ) -> None:
-        module: Any = inspect.getmodule(function)
-        docs = inspect.getdoc(function) or "", getattr(module, "__doc__", None) or ""
+        docs = inspect.getdoc(function) or "", docs_of_module(function)
         super().__init__(name, kind or kind_of(name, *docs), " ".join(docs))
         self.function, self.typed = function, typed
         try:

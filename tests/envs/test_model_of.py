@@ -267,6 +267,51 @@ def test_a_counter_that_rewards_depend_on() -> None:
     assert optimum(found) == pytest.approx(0.97, abs=1e-12)
 
 
+def first_hit(world: Any, rng: Any, action: int) -> Any:
+    """Remembers when the action was 1 for the first time, and pays that."""
+    world.x = world.x or action * world.time
+    return float(world.x) * (world.time >= 4), False, world.time >= 4
+
+
+def first_hit_at_end(world: Any, rng: Any, action: int) -> Any:
+    reward, _, is_over = first_hit(world, rng, action)
+    return reward, is_over, False
+
+
+def closed(world: Any, rng: Any, action: int) -> Any:
+    """Nothing may be asked of it after its end."""
+    return [1.0, 2.0, 3.0, 4.0][world.time - 1] * action, world.time == 4, False
+
+
+TIMES = {"a copy": (first_hit, 4.0), "a copy at the end": (first_hit_at_end, 4.0)}
+TIMES |= {"no step after the end": (closed, 10.0)}
+
+
+@pytest.mark.parametrize("name", TIMES)
+def test_a_counter_that_is_read(name: str) -> None:
+    rule, best = TIMES[name]
+    assert optimum(model_of(World(rule), **PATIENT), 100) == pytest.approx(best, abs=1e-12)
+
+
+class Around(gym.Env):
+    """Holds another environment, which it seeds."""
+
+    def __init__(self) -> None:
+        self.inner = gym.make("FrozenLake-v1", is_slippery=False).unwrapped
+        self.action_space, self.observation_space = spaces.Discrete(4), spaces.Discrete(16)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return self.inner.reset(seed=seed)
+
+    def step(self, action: int) -> Any:
+        return self.inner.step(action)
+
+
+def test_an_inner_environment_and_its_seed() -> None:
+    assert optimum(model_of(Around(), **PATIENT), 100) == pytest.approx(1.0, abs=1e-12)
+
+
 def climb(world: Any, rng: Any, action: int) -> Any:
     world.x += action
     return 0.0, False, False
@@ -335,6 +380,25 @@ def test_what_is_kept_over_the_reset_is_named() -> None:
     env.best = 0
     with pytest.raises(NotFinite, match="`best` is kept over `reset`"):
         model_of(env, **PATIENT)
+
+
+class Treasures(World):
+    """Each place pays once, and never again in later episodes."""
+
+    def __init__(self) -> None:
+        super().__init__(climb)
+        self.taken: set[int] = set()
+
+    def step(self, action: int) -> Any:
+        self.x += 1 + action
+        is_new = self.x not in self.taken
+        self.taken.add(self.x)
+        return self.x, float(is_new), self.x >= 5, False, {}
+
+
+def test_what_the_first_episodes_use_up_is_named() -> None:
+    with pytest.raises(NotFinite, match="`taken` is kept over `reset`"):
+        model_of(Treasures(), **PATIENT)
 
 
 class Deal(World):

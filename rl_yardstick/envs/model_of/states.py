@@ -128,6 +128,9 @@ class ByValue(pickle.Pickler):
         return ("set", *sorted(value, key=hash)) if kind in (set, frozenset) else None
 
     def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, gym.Env):  # an inner one
+            held = {name: part for name, part in vars(value).items() if name not in NO_STATE}
+            return type(value), (), held
         try:
             parts = value.__reduce_ex__(4)
         except Exception:  # noqa: BLE001 (classes decide what they raise)
@@ -154,7 +157,9 @@ class State:
         self.watched: dict[Place, Any] = {}  # what was last written to ghosts and clocks
         self.constants: dict[Place, Hashable] = {}  # by value
         self.fixed: Saved = []  # the constants of each layer, and what is no state
-        self.kept: dict[int, Any] = {}  # objects that are saved by reference, by id
+        self.kept: dict[int, Any] = {
+            id(layer): layer for layer in self.layers
+        }  # saved by reference
         self.in_short: list[tuple[Any, Any]] = []  # constants that can change in place
         self.is_plain = False  # whether watched attributes have values
 
@@ -347,7 +352,7 @@ class State:
 
     def contents(self, variables: Saved) -> list[tuple[Place, Hashable]]:
         """Attributes by value, also those that are saved by reference."""
-        kept, self.kept = self.kept, {}
+        kept, self.kept = self.kept, {id(layer): layer for layer in self.layers}
         held = [((i, k), v) for i, own in enumerate(variables) for k, v in own.items()]
         found = [(place, self.by_value(value)) for place, value in held]
         self.kept = kept
@@ -355,6 +360,7 @@ class State:
 
     def by_value(self, value: Any) -> Hashable:
         """Something hashable that is equal for equal values."""
+        value = value.now() if isinstance(value, Symbol) else value
         if isinstance(value, SIMPLE):
             return value
         if is_plain_array(value):
