@@ -38,8 +38,8 @@ def main() -> NoReturn:
 def run_command(name: str) -> NoReturn:
     """Run ``main`` of a command's module and leave the process.
 
-    Exit codes: 0; 1 if a study has runs that failed; 2 after a mistake, told in one line; 128 + the
-    number of a signal.
+    Exit codes: 0; 1 if a study has runs that failed; 2 after a mistake or an error of the user's
+    own code, told in one line; 128 + the number of a signal.
     """
     gc.set_threshold(100_000)  # importing the libraries makes many objects that stay
     for stream in (sys.stdout, sys.stderr):
@@ -60,7 +60,7 @@ def run_command(name: str) -> NoReturn:
 def _exit_code(name: str) -> int:
     from importlib import import_module
 
-    from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, visible
+    from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, own_calls, visible
 
     example, module = "", name.replace("-", "_")
     try:
@@ -80,11 +80,15 @@ def _exit_code(name: str) -> int:
         return 130
     except SystemExit as stop:  # argparse's, after --help
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-    except Exception:  # noqa: BLE001  # of the user's own code, or a bug
+    except Exception as error:  # noqa: BLE001  # of the user's own code, or a bug
         import traceback
 
-        traceback.print_exc()
-        return 1
+        if not (calls := own_calls(error)):
+            traceback.print_exc()
+            return 1
+        print(*traceback.format_list(calls), sep="", end="", file=sys.stderr)  # noqa: T201
+        where = getattr(error, "__notes__", [])
+        message = ": ".join([*where, type(error).__name__, one_line(error)])
     print(f"{os.path.basename(sys.argv[0])}: error: {visible(message)}", file=sys.stderr)  # noqa: PTH119, T201
     if example:
         print(example, file=sys.stderr)  # noqa: T201

@@ -20,7 +20,6 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 
@@ -28,12 +27,11 @@ from rl_yardstick.envs.model_of.check import seeded_globally
 from rl_yardstick.mdp.transition_model import TransitionModel
 from rl_yardstick.pipeline import environment_trial as trial
 from rl_yardstick.pipeline.environment_trial import Finding, Findings, layers_of, play
-from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.pipeline.errors import UserError, one_line, own_calls
 
 N_PLAYED, N_LONG, N_SEEDED = 1000, 6000, 120  # steps, as far as they take two seconds
 SLOW, LONG, HUGE = 0.003, 3.0, 1000.0  # seconds of a step, of one that hangs; a reward
 LATE = "the checks took too long here"  # what the command exits with after some seconds
-_OF_LIBRARIES = *np.__path__, *gymnasium.__path__, str(Path(__file__).parents[1])
 
 
 def examine(make: Callable[[], Any]) -> list[Finding]:
@@ -49,8 +47,7 @@ def examine(make: Callable[[], Any]) -> list[Finding]:
                     raise
                 is_late = error.args == (LATE,)
                 calls = traceback.extract_tb(error.__traceback__)[: -1 if is_late else None]
-                own = [call for call in calls if not call.filename.startswith(_OF_LIBRARIES)]
-                last = (own or calls)[-1]
+                last = (own_calls(error) or calls)[-1]
                 where = f"{Path(last.filename).name}:{last.lineno}"
                 told = LATE if is_late else f"{type(error).__name__}: {one_line(error)}"
                 is_stuck = is_late and time.monotonic() - found.since > LONG

@@ -309,15 +309,17 @@ class EvaluationCallback(EvalCallback):
             is_due |= self.episodes_seen // every > before // every
         if is_due and isinstance(self.evaluator, SampledEvaluator):
             is_due = self.evaluator.can_afford(self.model, self.episodes_seen)
-        return self.evaluate() if is_due else True
+        if is_due:
+            self.evaluate()
+        return True
 
     def _on_training_end(self) -> None:
         self.write()
 
-    def evaluate(self) -> bool:
-        """Evaluate the current agent; False if a callback asks to stop the training."""
+    def evaluate(self, found: Evaluation | None = None) -> None:
+        """Add a point to the curve: an evaluation of the current agent, unless one is given."""
         check_model(self.model)
-        found = self.timed(self.evaluator)
+        found = found or self.timed(self.evaluator)
         self.last_mean_reward = found.mean_return
         self.evaluations_timesteps.append(self.num_timesteps)
         self.evaluations_results.append(found.returns.tolist())
@@ -340,11 +342,15 @@ class EvaluationCallback(EvalCallback):
             self.logger.record(f"eval/{name}", value)
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
+        self.keep_if_best(found)
+
+    def keep_if_best(self, found: Evaluation) -> None:
+        """Save the current agent, if no earlier one was evaluated as good."""
         if found.mean_return > self.best_mean_reward:
             self.best = self.best_mean_reward = found.mean_return
-            self.best_timesteps, self.best_episodes = self.num_timesteps, self.n_episodes[-1]
+            self.best_timesteps = self.model.num_timesteps
+            self.best_episodes = 0 if found.is_exact else len(found.returns)
             save_agent(self.model, self.run.best_model_path)
-        return self._on_event() if self.callback is not None else True
 
     def timed(self, evaluator: Callable[[BaseAlgorithm], Evaluation]) -> Evaluation:
         """Evaluate the agent with training's current normalisation statistics; its time counts."""

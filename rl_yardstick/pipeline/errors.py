@@ -5,8 +5,11 @@ from __future__ import annotations
 import difflib
 import re
 import reprlib
+import sysconfig
+import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 _SHORT_LIST = 12
 # Other names of hyperparameters, too different in spelling to be found by similarity.
@@ -15,6 +18,10 @@ OTHER_NAMES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("epsilon", "eps"), ("exploration_final_eps", "exploration_initial_eps")),
     **dict.fromkeys(("discount", "discount_factor"), ("gamma",)),
 }
+
+# Where code is that is not the user's own: libraries, this project, Python's imports.
+_LIBRARIES = (sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
+_NOT_OWN = (*_LIBRARIES, f"{Path(__file__).parents[1]}/", "<frozen")
 
 _brief = reprlib.Repr()
 _brief.maxstring = _brief.maxother = 60
@@ -65,6 +72,12 @@ def one_line(error: BaseException) -> str:
         return " ".join(str(error).split()) or type(error).__name__
     except Exception:  # noqa: BLE001  # a stranger's `__str__` can fail in any way
         return type(error).__name__
+
+
+def own_calls(error: BaseException) -> list[traceback.FrameSummary]:
+    """The calls in an error's traceback that are in the user's own code."""
+    calls = traceback.extract_tb(error.__traceback__)
+    return [call for call in calls if not call.filename.startswith(_NOT_OWN)]
 
 
 @contextmanager

@@ -55,7 +55,8 @@ def draw(folder: Path, parts: Any) -> None:
             scale = None if parts.final is None else parts.final.yardstick
             means = [float(np.mean(row)) for row in evaluation.evaluations_results]
             evaluations = dict(zip(evaluation.evaluations_timesteps, means, strict=True))
-            places = folder, spec.title, evaluations, agent._num_timesteps_at_start, scale
+            final = {} if parts.final is None else {agent.num_timesteps: parts.final.mean_return}
+            places = folder, spec.title, evaluations | final, agent._num_timesteps_at_start, scale
             draw_learning_curve(*places, on_variant=bool(training_changes(spec)))
         if evaluation.value_maps is not None and evaluation.is_asked_for:
             found = value_map(evaluation.value_maps.evaluator, agent)

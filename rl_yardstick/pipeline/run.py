@@ -93,8 +93,8 @@ class Run:
         try:
             self._lock.acquire()
         except Timeout:
-            pid = self.recorded().get("pid", "unknown")
-            raise UserError(f"{self.path} is in use by another command, process {pid}") from None
+            process = f", process {pid}" if (pid := self.recorded().get("pid")) else ""
+            raise UserError(f"{self.path} is in use by another command{process}") from None
         except NotImplementedError as error:  # no flock
             raise UserError(f"{self.path}: {error}") from error
         return self

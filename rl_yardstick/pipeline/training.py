@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict
@@ -17,7 +16,6 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-import rl_yardstick
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
 from rl_yardstick.envs import found_models
@@ -27,7 +25,7 @@ from rl_yardstick.pipeline import callbacks
 from rl_yardstick.pipeline.components import action_noise, build, constructor_arguments
 from rl_yardstick.pipeline.environment_trial import tried
 from rl_yardstick.pipeline.environments import first_seed, make_training_env, training_changes
-from rl_yardstick.pipeline.errors import Stopped, UserError, one_line
+from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, own_calls
 from rl_yardstick.pipeline.evaluation.critics import recorder_of
 from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
@@ -187,8 +185,9 @@ class Training:
                     **({} if interval == -1 and is_read else kwargs),
                 )
                 self.progress.read_clock()
-        except OF_LIBRARIES as e:
-            check_model(agent)  # PyTorch's error for nan in distributions is obscure
+        except Exception as e:  # noqa: BLE001  # the user's own code may raise any
+            if isinstance(e, OF_LIBRARIES):
+                check_model(agent)  # PyTorch's error for nan in distributions is obscure
             raise told(e, f"{spec.title}, at step {agent.num_timesteps:,}")  # noqa: B904
         finally:
             self.progress.bar.stop()
@@ -199,17 +198,17 @@ class Training:
         save_agent(self.agent, self.run.model_path(self.spec), buffer)
 
     def judge_the_end(self) -> None:
-        """Do missing evaluations and the final one."""
+        """Do the final evaluation, which may be the best one, or the only one."""
         evaluation, agent = self.evaluation, self.agent
         if evaluation.is_asked_for:
-            if not evaluation.evaluations_timesteps:  # the run was shorter than their interval
-                evaluation.init_callback(agent)
-                evaluation.evaluate()
+            self.final = evaluation.timed(evaluation.evaluator.at_the_end)
+            evaluation.keep_if_best(self.final)
+            if not evaluation.evaluations_timesteps:  # none was due, or affordable
+                evaluation.evaluate(self.final)
             if evaluation.value_maps is not None:
                 evaluation.value_maps.finish(agent)
             if evaluation.critics is not None:
                 evaluation.critics.finish(agent.num_timesteps)
-            self.final = evaluation.timed(evaluation.evaluator.at_the_end)
             self.evaluation_steps = getattr(evaluation.evaluator, "n_steps", 0)
         self.engine = getattr(agent, "engine_in_use", None)
         if self.pulls is not None and self.pulls.n_calls > 0:
@@ -233,11 +232,12 @@ class Training:
 
 
 def told(error: Exception, where: str) -> Exception:
-    """An error of the user's own code as it is, any other in one line."""
-    raised_in = traceback.extract_tb(error.__traceback__)[-1].filename
-    ours = "site-packages", str(Path(rl_yardstick.__file__).parent)
-    is_ours = any(place in raised_in for place in ours) and not isinstance(error, UserError)
-    return UserError(f"{where}: {one_line(error)}") if is_ours else error
+    """An error of the user's own code with a note of where it was, one of a library in a line."""
+    if own_calls(error):
+        error.add_note(where)
+    elif isinstance(error, OF_LIBRARIES):
+        return UserError(f"{where}: {one_line(error)}")
+    return error
 
 
 def numbered_spaces(agent: Any) -> Iterator[str]:

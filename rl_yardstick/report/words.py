@@ -321,14 +321,17 @@ def _standing(analysis: StudyAnalysis) -> Iterator[str]:
     end = "lowest" if study.metric in COSTS else "highest"
     yield f"With {over}, {_names(best)} {has} the {end} mean {what}{where}."
     said: dict[str, list[Pair]] = {}
-    for pair in (p for one in learnt for p in pairs_both_ways(one.pairs).values()):
+    everything = [p for one in learnt for p in pairs_both_ways(one.pairs).values()]
+    for pair in everything:
         if pair.first == best[0]:
             said.setdefault(pair.text, []).append(pair)
     for text, pairs in sorted(said.items()):
-        more = [pair.seeds_needed - pair.n for pair in pairs if pair.seeds_needed is not None]
         if text == "undecided":
+            named = {(pair.environment, pair.second) for pair in pairs}
+            open_ = [p for p in everything if p.text == text and (p.environment, p.second) in named]
+            more = [pair.seeds_needed - pair.n for pair in open_ if pair.seeds_needed is not None]
             would = f" ({seeds(max([1, *more])).replace(' ', ' more ')} would)"
-            would = would if len(more) == len(pairs) else ""
+            would = would if len(more) == len(open_) else ""
             yield f"Not settled: {_others(pairs, len(places))}{would}."
         else:
             word, _, few = text.partition(" ")

@@ -80,9 +80,10 @@ class Best:
     agents: tuple[str, ...]  #: by mean, the highest first
     tied: bool  #: whether all of them are tied
     so_far: bool  #: whether runs are few for the words behind it
+    otherwise: str = "undecided"  #: how they stand if not
 
     def __str__(self) -> str:
-        words = [] if len(self.agents) < 2 else ["tied" if self.tied else "undecided"]
+        words = [] if len(self.agents) < 2 else ["tied" if self.tied else self.otherwise]
         words += ["so far"] if self.so_far and words != ["undecided"] else []
         between = "; " if any("," in name for name in self.agents) else ", "
         names = between.join(self.agents) or "none"
@@ -250,7 +251,8 @@ def _study(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> 
         threshold = thresholds[environment] = failure_threshold(baseline, runs.values())
         here = [describe(environment, name, runs[name], ends, threshold) for name in runs]
         agents += here
-        best[environment] = _best(here, [pair for pair in pairs if pair.environment == environment])
+        those = [pair for pair in pairs if pair.environment == environment]
+        best[environment] = _best(here, those, rules.against)
     seeds = {e: {name: np.size(values) for name, values in r.items()} for e, r in scores.items()}
     return Study(agents, pairs, best, thresholds, found.levels[0], seeds)
 
@@ -276,7 +278,7 @@ def _pair(rules: _Rules, key: Key, evidence: _Evidence, found: _Words) -> Pair:
     )
 
 
-def _best(agents: Sequence[AgentRuns], pairs: Sequence[Pair]) -> Best:
+def _best(agents: Sequence[AgentRuns], pairs: Sequence[Pair], against: str) -> Best:
     said = [one for pair in pairs for one in (pair, pair.swapped())]
     behind = {pair.first for pair in said if pair.word == "worse"}
     there = [agent for agent in agents if agent.n and agent.name not in behind]
@@ -285,7 +287,11 @@ def _best(agents: Sequence[AgentRuns], pairs: Sequence[Pair]) -> Best:
     n_pairs = len(names) * (len(names) - 1) // 2
     is_tied = len(among) == n_pairs > 0 and all(pair.word == "tied" for pair in among)
     leads = [pair for pair in said if pair.first in names and pair.word in ("better", "tied")]
-    return Best(tuple(names), is_tied, so_far=any(pair.so_far for pair in leads))
+    # Where all are compared with one agent alone, more seeds would not tell them apart.
+    how = sorted({pair.word for pair in said if pair.first in names and pair.second == against})
+    relation = " or ".join(how).replace("better", "better than").replace("tied", "tied with")
+    otherwise = f"{relation} {against}" if how and "undecided" not in how else "undecided"
+    return Best(tuple(names), is_tied, any(pair.so_far for pair in leads), otherwise)
 
 
 def _grown(rules: _Rules, scores: Scores, looks: Sequence[int]) -> Study:

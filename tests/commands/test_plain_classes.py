@@ -87,6 +87,8 @@ class Kept(Net):
         return {"q": self.q, "f": lambda: 0}
 class Fails(Table):
     def __init__(self): raise RuntimeError("no table")
+class Breaks(Table):
+    def learn(self, *transition): self.qq[0] += 1
 number = 3
 """
 CELL = """
@@ -203,6 +205,20 @@ def test_what_is_no_agent_is_refused(typed, own_folder, name, words):
 def test_an_error_of_its_constructor_goes_through():
     with pytest.raises(RuntimeError, match="no table"):
         run_of(spec_for("Fails", 20))
+
+
+def test_an_error_of_its_own_is_told_by_its_lines_and_one_of_ours(typed, own_folder):
+    words = "--env", LAKE, "--seed", "1", "-n", "20"
+    code, _, err = typed("train.py", "--algo", "mine:Breaks", *words)
+    calls, told = err.splitlines()[:-1], err.splitlines()[-1]
+    assert (code, [line for line in calls if "File" in line]) == (2, calls[:1])
+    assert "mine.py" in calls[0]
+    assert told == (
+        "train.py: error: mine.Breaks on FrozenLake-v1, seed 1, at step 1: "
+        "AttributeError: 'Breaks' object has no attribute 'qq'"
+    )
+    (record,) = own_folder.glob("logs/*/*/run.json")
+    assert json.loads(record.read_text())["state"] == "failed"
 
 
 def test_commands_take_it(typed, own_folder, in_this_process):

@@ -90,8 +90,9 @@ def test_a_process_that_is_left_early_has_not_succeeded(own_folder):
 def test_an_exception_without_words_ends_the_run(typed, own_folder):
     (own_folder / "now").touch()
     code, _, err = typed(*training("Rude"))
-    assert code == 1
-    assert "RudeError" in err
+    assert code == 2
+    where = "qlearning on Rude-v0, seed 0, at step 0"
+    assert err.endswith(f"{where}: RudeError: RudeError\n")
 
 
 def test_a_map_from_another_editor(typed, own_folder):

@@ -39,7 +39,7 @@ def test_numbers_are_given_once_and_the_newest_is_last():
     assert [number for number, _ in found] == list(range(1, 13))
     assert [path for _, path in found] == paths
     # Each is held by one command at a time.
-    with pytest.raises(UserError, match="use by another command, process unknown"), Run(paths[0]):
+    with pytest.raises(UserError, match=r"in use by another command$"), Run(paths[0]):
         Run(paths[0]).__enter__()
 
 

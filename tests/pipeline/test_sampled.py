@@ -23,6 +23,7 @@ from rl_yardstick.pipeline.evaluation.sampled import (
     evaluate_compiled,
     evaluation_seed,
 )
+from rl_yardstick.pipeline.models import load
 from tests.pipeline.short_runs import CART, LAKE, Steady, agent_of, run_of, spec_of
 
 CAR = "MountainCar-v0"
@@ -89,6 +90,28 @@ def test_the_last_evaluation_ends_when_it_is_sure_or_dear(monkeypatch, returns, 
     found = evaluator.at_the_end(agent_of("random", make_training_env(spec, None)))
     assert len(found.returns) == n_episodes
     assert evaluator.n_steps == n_episodes * length
+
+
+def test_evaluations_are_too_dear_before_an_episode_has_ended(tmp_path, monkeypatch):
+    """The last one is then the only point of the curve, and the best."""
+    run, outcome = run_of(steady(monkeypatch, [1.0, 5.0], 900, 1000), tmp_path)
+    assert (outcome.evaluation_steps, outcome.evaluation.best_timesteps) == (4500, 1000)
+    with np.load(run.path / "evaluations.npz") as evaluations:
+        assert evaluations["timesteps"].tolist() == [1000]
+        assert evaluations["results"].tolist() == [outcome.final.returns.tolist()]
+
+
+@pytest.mark.parametrize(("late", "best"), [(9.0, [100, 50]), (-9.0, [50, 5])])
+def test_the_last_evaluation_may_be_the_best(tmp_path, monkeypatch, late, best):
+    spec = steady(monkeypatch, [1.0] * 20 + [late] * 100, 1, 100)
+    spec = spec.changed(eval_freq=50, eval_episodes=5, final_episodes=50)
+    run, outcome = run_of(spec, tmp_path)
+    record = run.recorded()
+    assert [record["best_timesteps"], record["best_episodes"]] == best
+    assert record["best_mean_return"] == max(1.0, outcome.final.mean_return)
+    with np.load(run.path / "evaluations.npz") as evaluations:
+        assert evaluations["results"].tolist() == [[1.0] * 5] * 2
+    assert load(spec, run.best_model_path, None).num_timesteps == best[0]
 
 
 def test_evaluations_are_left_out_while_they_are_too_dear(tmp_path, monkeypatch):

@@ -67,6 +67,10 @@ def test_who_is_best(means, changes, lead):
 
 
 OPEN = (made_up.pair(*"ab", "undecided", seeds_needed=793), made_up.pair(*"ac", "undecided"))
+TWICE_OPEN = (
+    made_up.pair(*"ab", "tied"),
+    *(made_up.pair(*two, "undecided", seeds_needed=n) for two, n in (("ac", 23), ("bc", 40))),
+)
 FEW = (made_up.pair(*"ab", "tied", so_far=True), made_up.pair(*"ac", "better", so_far=True))
 
 
@@ -123,6 +127,8 @@ ANSWERS = {
     "none.": [place_of({}, pairs=FEW), place_of({}, pairs=OPEN[1:], label="sea")],
     "a has the highest mean return of the final policy: 100. Not settled: b (789 more seeds "
     "would).": [place_of({}, pairs=OPEN[:1], is_score=False, failure_threshold=None)],
+    "a has the highest mean score: 1. Certain: a is tied with b. Not settled: c (36 more seeds "
+    "would). Failed runs: none.": [place_of({}, pairs=TWICE_OPEN)],
     "a and b have the highest mean score in 1 of 2 environments each. No agent has learnt on 2. "
     "Failed runs: none.": [place_of({}, dict.fromkeys("ab", x), label=f"{x}") for x in (90.0, 2)],
     "": [],

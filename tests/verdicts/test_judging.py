@@ -139,6 +139,21 @@ def test_the_best_are_those_that_nobody_is_shown_to_beat():
     assert str(judge({"w": {"x": [NAN]}}).best["w"]) == "none"
 
 
+@pytest.mark.parametrize(
+    ("others", "best"),
+    [
+        ({"y": 0.0}, "x, y (tied)"),
+        ({"y": 0.0, "z": 0.0}, "x, y, z (tied with x)"),
+        ({"y": 9.0, "z": 9.0}, "y, z (better than x)"),
+        ({"y": 9.0, "z": 0.0}, "y, z (better than or tied with x)"),
+        ({"y": 0.0, "z": [-9.0, 9.0] * 5}, "x, y, z (undecided)"),
+    ],
+)
+def test_agents_that_are_compared_with_one_alone_stand_as_they_do_to_it(others, best):
+    scores = {name: np.broadcast_to(runs, 10) for name, runs in {"x": 0.0, **others}.items()}
+    assert str(judge({"w": scores}, margin=0.1, against="x").best["w"]) == best
+
+
 def test_against_one_agent_only_its_pairs_are_tested():
     scores = drawn(0, 6, 0.5, 0.6, 0.7)
     study = judge({"w": scores}, against="a1", margin=0)

@@ -114,9 +114,9 @@ class SampledEvaluator:
 
     def can_afford(self, model: BaseAlgorithm, n_episodes: int) -> bool:
         """Whether the training has done enough steps for another evaluation."""
+        n_trained = model.num_timesteps - model._num_timesteps_at_start
         # Explicit intervals or numbers of episodes take precedence over the limit.
         if self.spec.eval_episodes is None and self.spec.eval_freq is None:
-            n_trained = model.num_timesteps - model._num_timesteps_at_start
             progress = n_trained / (self.spec.n_timesteps or math.inf)
             if self.spec.n_episodes is not None:
                 progress = n_episodes / self.spec.n_episodes
@@ -124,9 +124,9 @@ class SampledEvaluator:
             allowed = self._allowed(model, planned) * min(progress, 1.0)
             self._left = allowed * PART_DURING_TRAINING - self.n_steps
         length = self._last_length
-        if length is None:  # then of training's last episodes
+        if length is None:  # then of training's last episodes, or of the first ones so far
             lengths = [episode["l"] for episode in getattr(model, "ep_info_buffer", None) or ()]
-            length = float(np.mean(lengths[-STAGES[0] :])) if lengths else 1.0
+            length = float(np.mean(lengths[-STAGES[0] :] or n_trained / model.n_envs))
         return STAGES[0] * length <= self._left
 
     def __call__(self, model: BaseAlgorithm) -> Evaluation:
