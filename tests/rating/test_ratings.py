@@ -177,7 +177,7 @@ REFUSED = {
     "named actions": ({s: {"left": 0.0, "up": 0.0} for s in range(16)}, "the key (0, 'left'), "),
     "nan in pandas": (pd.DataFrame(np.eye(16, 4)).replace(1, np.nan), "nan in states [0, 1, 2, 3]"),
     "a state twice": (pd.DataFrame(np.eye(16, 4), index=[0] * 16), "several rows of one state"),
-    "a class to be given something": (type("A", (), {"__init__": lambda self, env: 0}), "'env'; rate an object"),
+    "a class to be given something": (type("A", (), {"__init__": lambda self, env: 0}), "'env'; "),
     "a function of two": (lambda state, values: 0, "'values'; a policy gets the obs"),
     "keys of two kinds": ({0: [0] * 4, (1, 2): [0] * 4}, "no state of FrozenLake-v1"),
     "hands": (hands(), "[4, 1, 0] is not in Discrete(16)"),
