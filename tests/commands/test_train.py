@@ -49,6 +49,7 @@ ENDS = {  # final evaluations; how the output then ends is in the file
     "without an optimum": sampled(*[487.25] * 100),
     "without a scale": exact(749.5, None, 750.0, 750.0),
     "nearly without a scale": exact(750.0, None, 751.0, 750.0),
+    "hidden without a scale": exact(-10.0, None, -10.0, -10.0, hidden=HIDES),
     "hidden": exact(-80.0, 1 / 15, 93.8, -40.0, 35.0, hidden=HIDES),
 }
 SAID = yaml.safe_load(Path(__file__).with_name("ends_of_runs.yml").read_text(encoding="utf-8"))
