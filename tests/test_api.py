@@ -89,6 +89,9 @@ def test_the_optimum_is_that_of_the_arguments():
     assert (dry["optimum"], dry["horizon"], dry["values"][0]) == (1, 50, 1)
     assert dry["actions"].shape == (16, 4)
     assert ys.optimum("FrozenLake-v1", is_slippery=False, max_episode_steps=5)["optimum"] == 0
+    # Five times -0.1 and once 0.5, which sum to 0 but for rounding.
+    costly = {"reward_schedule": (0.5, -9, -0.1), "is_slippery": False, "max_episode_steps": 6}
+    assert ys.optimum("FrozenLake-v1", **costly)["optimum"] == 0
 
 
 def test_an_explanation_is_of_a_run_a_path_or_a_model(run):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -47,7 +48,7 @@ def build_parser() -> OneLineParser:
 def main() -> int:
     """Explain an agent."""
     args = build_parser().parse_args()
-    from rl_yardstick.report.words import as_words, why_lines
+    from rl_yardstick.report.words import why_lines
 
     console = TextConsole()
     found, agent, evaluator = asked(console, wanted_model(args))
@@ -56,8 +57,10 @@ def main() -> int:
     explained = explanation(found.spec, agent, evaluator)
     say(console, "\n".join(why_lines(explained)))
     if explained.proposals and args.test is None:
-        likeliest = ", ".join(f"--test {as_words(one)}" for one in explained.proposals[:2])
-        say(console, f"to see what helps: {likeliest}, or --test alone")
+        say(console, "to see what helps, one change or all that are proposed:")
+        for change in (*explained.proposals[:2], ""):
+            typed = *sys.argv[1:], "--test", *change.split()
+            say(console, f"  {cli.to_copy('explain', *typed)}")
     data = explained.as_data()
     if args.map is not None:
         draw(args.map, f"{found.spec.algo} on {found.spec.place}", agent, evaluator, explained)

@@ -60,7 +60,7 @@ def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], 
     from rl_yardstick.envs import known_models as known
     from rl_yardstick.pipeline.environments import with_files_read
     from rl_yardstick.pipeline.evaluation.exact import known_model
-    from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+    from rl_yardstick.pipeline.evaluation.yardstick import Yardstick, rounding
     from rl_yardstick.rating.worlds import world_of
 
     world = world_of(env_id, with_files_read(env_id, {"env_kwargs": {**kwargs}})["env_kwargs"])
@@ -73,6 +73,8 @@ def optimum_of(env_id: str, kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], 
     if masks is not None:
         actions &= masks | ~model.reachable[:, None]
     best, baseline = float(model.initial @ values), float(mdp.baseline_return(model, horizon))
+    if abs(best) <= rounding(horizon * float(np.abs(model.reward).max())):
+        best = 0.0  # a sum of rewards that cancel out
     n_states = int(model.reachable.sum())
     scale = Yardstick(best, baseline) if world.exact is None else world.exact.yardstick
     how = "of the environment" if search is None else f"found in its code in {search.seconds:.1f} s"

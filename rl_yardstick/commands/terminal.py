@@ -127,21 +127,31 @@ def _returned(
 
 def scale_lines(yardstick: Yardstick) -> list[str]:
     """What a score of 0 is; and the optimum, if it is bracketed or there are several."""
-    baseline = f"return {figures(yardstick.baseline)[0]}{APART}best random or constant policy"
-    lines = [f"{'score 0' if yardstick.has_scale else 'no score'}{APART}{baseline}"]
     hidden, most = yardstick.hidden, yardstick.optimum
+    kind = ""
+    if hidden is not None:
+        kind = " with memory" if hidden.with_memory else " without memory"
+    first, meaning = "score 0", "best random or constant policy"
+    if not yardstick.has_scale:
+        nearly = "nearly " * (most - yardstick.baseline > rounding(most))
+        first, meaning = "no score", f"a random or constant policy is {nearly}optimal{kind}"
+    lines = [f"{first}{APART}return {figures(yardstick.baseline)[0]}{APART}{meaning}"]
     if hidden is None and yardstick.at_least is None:
         return lines
     least = most if yardstick.at_least is None else yardstick.at_least
-    optima = [" to ".join(dict.fromkeys(figures(least, most)))]
-    optima[0] += "" if yardstick.is_proven else " (the upper end is not proven)"
+    optima = [_span(least, most)]
+    optima[0] += kind if yardstick.is_proven else f" (the upper end is not proven){kind}"
     if hidden is not None:
-        optima[0] += " with memory" if hidden.with_memory else " without memory"
         if not hidden.with_memory:
-            known = dict.fromkeys(figures(*hidden.memory_optimum))
-            optima.append(f"{' to '.join(known)} with memory")
+            optima.append(f"{_span(*hidden.memory_optimum)} with memory")
         optima.append(f"{figures(hidden.full_optimum)[0]} by the state")
     return [*lines, f"optimum{APART}{', '.join(optima)}"]
+
+
+def _span(least: float, most: float) -> str:
+    """Two ends, or one figure where they round to the same."""
+    low, high = figures(least, most)
+    return high if float(low) == float(high) else f"{low} to {high}"
 
 
 def _score(yardstick: Yardstick, value: float) -> str:

@@ -76,7 +76,7 @@ def transition_model(env: Env) -> TransitionModel | None:
     ``P`` and ``initial_state_distrib`` as toy_text's do, and those in which a search finds it. A
     time limit is no part of the model: see `time_limit`. None where the model is not known.
     """
-    core, wrappers = _core_of(env)
+    core, wrappers = core_of(env)
     known = _believed(core)
     if known is None:
         return None
@@ -103,12 +103,12 @@ def model_check(env: Env) -> ModelCheck | None:
 
     Trusted environments pass without a test.
     """
-    return _judged(_core_of(env)[0])[1]
+    return _judged(core_of(env)[0])[1]
 
 
 def found_model(env: Env) -> FoundModel | None:
     """What a search has found of an environment; None where the model is not from a search."""
-    found = _judged(_core_of(env)[0])[0]
+    found = _judged(core_of(env)[0])[0]
     return found if isinstance(found, FoundModel) else None
 
 
@@ -117,7 +117,7 @@ def why_unknown(env: Env, at_limits_only: bool = False) -> str | None:
 
     With ``at_limits_only``, a search has nothing to say but that it ended at its limits.
     """
-    found, check = _judged(_core_of(env)[0])
+    found, check = _judged(core_of(env)[0])
     if not isinstance(found, NotFound):
         return None if check is None else check.refusal
     return found.reason if found.is_at_limit or not at_limits_only else None
@@ -140,7 +140,7 @@ def success_outcomes(env: Env) -> Bools | None:
     of FrozenLake and CliffWalking, the passenger delivered in Taxi. In Blackjack it is any win.
     None where the model is not known or no episode terminates.
     """
-    base, known = env.unwrapped, _believed(_core_of(env)[0])
+    base, known = env.unwrapped, _believed(core_of(env)[0])
     if known is None:
         return None
     model = known.model
@@ -160,7 +160,7 @@ def success_outcomes(env: Env) -> Bools | None:
 
 def observations_of_states(env: Env) -> NDArray[Any] | None:
     """The observation of each state of `transition_model`; None where it is not known."""
-    core, wrappers = _core_of(env)
+    core, wrappers = core_of(env)
     known = _believed(core)
     observations = None if known is None else known.observations
     for wrapper in wrappers:
@@ -175,7 +175,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
     Known for this project's environments, Gymnasium's Taxi, and `IdleActionMasks`, under known
     wrappers, and where some actions raise an error; None elsewhere.
     """
-    core, wrappers = _core_of(env)
+    core, wrappers = core_of(env)
     idle = [wrapper.masks for wrapper in wrappers if isinstance(wrapper, IdleActionMasks)]
     if idle:
         return np.array(idle[-1])
@@ -203,7 +203,7 @@ def layers(env: Env) -> tuple[Env, list[Wrapper]]:
     return env, wrappers[::-1]
 
 
-def _core_of(env: Env) -> tuple[Env, list[Wrapper]]:
+def core_of(env: Env) -> tuple[Env, list[Wrapper]]:
     """The environment up to its outermost unknown wrapper; and those around, innermost first."""
     base, wrappers = layers(env)
     unknown = [place for place, wrapper in enumerate(wrappers, 1) if not folds(wrapper)]
@@ -235,7 +235,7 @@ def _believed(core: Env) -> PublishedModel | FoundModel | None:
 @contextmanager
 def one_look(env: Env) -> Iterator[None]:
     """Cache the model of ``env``, which must not change within the ``with`` statement."""
-    core = _core_of(env)[0]
+    core = core_of(env)[0]
     _looked_at[id(core)] = _judged(core)
     try:
         yield

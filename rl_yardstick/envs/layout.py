@@ -13,12 +13,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
 
 from rl_yardstick.envs.grid import MOVES, Grid, GridWorld, Tile
-from rl_yardstick.envs.known_models import found_model
+from rl_yardstick.envs.known_models import core_of, observations_of_states
 from rl_yardstick.envs.textbook.grids import WindyGridworldEnv
 from rl_yardstick.mdp.transition_model import Ints
 
@@ -124,6 +125,8 @@ def action_names(env: gym.Env[Any, Any]) -> tuple[str, ...]:
         return tuple(map(str, given))
     if isinstance(env.unwrapped, TaxiEnv):
         return ("south", "north", "east", "west", "pick up", "drop off")
+    if isinstance(env.unwrapped, BlackjackEnv):
+        return ("stick", "hit")
     layout = grid_layout(env)
     return () if layout is None else tuple(_NAMES.get(move, str(move)) for move in layout.moves)
 
@@ -139,7 +142,9 @@ def state_name(env: gym.Env[Any, Any], layout: GridLayout | None, state: int) ->
         row, column, passenger, target = base.decode(state)
         where = "on board" if passenger == 4 else f"at {'RGYB'[passenger]}"
         return f"row {row + 1}, column {column + 1}, passenger {where}, to {'RGYB'[target]}"
-    if (found := found_model(env)) is not None and found.observations is not None:
-        shown = " ".join(str(found.observations[state]).split())
-        return f"state {state}, seen as {textwrap.shorten(shown, 40, placeholder=' ...')}"
-    return f"state {state}"
+    observations = observations_of_states(core_of(env)[0])
+    if observations is None or np.array_equal(observations, range(len(observations))):
+        return f"state {state}"
+    seen = observations[state]
+    told = str(tuple(seen.tolist()) if seen.ndim == 1 and seen.dtype.kind in "iu" else seen)
+    return f"state {state}, seen as {textwrap.shorten(told, 40, placeholder=' ...')}"

@@ -100,8 +100,9 @@ def results_of(
     is_last = any(len(log.evaluations.steps) for log in logs)
     words = WORDS.get(kind) or f"{'last ' if is_last else ''}{kind}"
     notes.append(f"figure of each run: {'mean ' if kind in WORDS else ''}{words}")
-    if n := len(every) - len(logs):
-        notes.append(f"left out: {n:,} run{'s' * (n > 1)} without such a figure")
+    if left := [log.place for log in every if kind not in log.figures]:
+        n, more = len(left), ", ..." * (len(left) > 1)
+        notes.append(f"left out: {n:,} run{'s' * (n > 1)} without such a figure: {left[0]}{more}")
     labels = [(log.labels["agent"], log.labels["env"]) for log in logs]
     agents = list(dict.fromkeys(agent for agent, _ in labels))
     if len(agents) == 1:

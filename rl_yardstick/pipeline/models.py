@@ -118,7 +118,8 @@ def _find_run(wanted: Wanted) -> Path:
     if not runs:
         check_agent(algo)
         check_env_id(env_id)
-        raise UserError(f"no run of {algo} on {name} in {wanted.log_folder}")
+        made = f"train.py --env {env_id} --algo {algo} makes one"
+        raise UserError(f"no run of {algo} on {env_id} in {wanted.log_folder}: {made}")
     if number and number not in runs:
         where, known = wanted.log_folder, ", ".join(map(str, runs))
         raise UserError(f"no run {number} of {algo} on {name} in {where}: there is {known}")

@@ -311,6 +311,7 @@ def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
 VALUE_COLOURS = ("#FFFBD6", "#D3ECC0", "#8FD0C0", "#55B0CC", "#4A97CF")
 COST_COLOURS = ("#FFFFFF", "#FBD9B5", "#F2994A", "#C8501E")
 MAX_LAYERS = 4
+VALUES = "expected return from here on"
 LEAST_SHARE = 0.5  # per cent of the gap; cells with a lower cost stay empty
 MAX_TICKS = 6
 DIM = "#777777"
@@ -333,7 +334,7 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
     agent = _agents_side(found)
     best = f"optimum, all best actions: return {_at_start(found, found.optimal_values)}"
     sides = agent, agent._replace(title=best, is_best=True)
-    _draw(path, title, sides, agent, "expected return from here on")
+    _draw(path, title, sides, {VALUES: agent})
 
 
 def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> None:
@@ -346,8 +347,9 @@ def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> No
     told = f"loss of its actions: {losses.sum():,.4g} in total"
     scale = 0.0, max(float(shares.max()), 1e-12)
     cost = Side(told, costs, False, *_scaled(scale, COST_COLOURS), 0)
-    bar = "share of the gap lost there, in per cent"
-    _draw(path, title, (_agents_side(found), cost), cost, bar)
+    agent = _agents_side(found)
+    bars = {VALUES: agent, "share of the gap, in per cent": cost}
+    _draw(path, title, (agent, cost), bars)
 
 
 def _agents_side(found: ValueMap) -> Side:
@@ -371,7 +373,7 @@ def _scaled(ends: tuple[float, float], names: tuple[str, ...]) -> tuple[Normaliz
     return Normalize(*ends), LinearSegmentedColormap.from_list("", names)
 
 
-def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar: str) -> None:
+def _draw(path: Path, title: str, sides: tuple[Side, Side], bars: dict[str, Side]) -> None:
     from matplotlib.cm import ScalarMappable
 
     found = sides[0].shown
@@ -388,10 +390,11 @@ def _draw(path: Path, title: str, sides: tuple[Side, Side], explained: Side, bar
             places = [layout.place_name(place) for place in layout.collected_in(layer)]
             collected = f"{layout.names.get(PRIZE, 'prize')} collected at {'; '.join(places)}"
             pair[0].set_ylabel(collected if places else "nothing collected")
-    source = ScalarMappable(explained.scale, explained.colours)
-    colour_bar = figure.colorbar(source, ax=figure.axes, aspect=30, pad=0.02)
-    colour_bar.set_label(bar)
-    colour_bar.ax.spines[:].set_visible(False)
+    for (label, side), *own in zip(bars.items(), *pairs, strict=False):
+        source = ScalarMappable(side.scale, side.colours)
+        beside = own if len(bars) > 1 else figure.axes
+        colour_bar = figure.colorbar(source, ax=beside, label=label, aspect=30, pad=0.02)
+        colour_bar.ax.spines[:].set_visible(False)
     style: Any = {"fontsize": 9, "frameon": False, "loc": "outside lower left"}
     n_columns = int(np.clip(figure.get_figwidth() / 2.6, 1, 4))
     figure.legend(handles=list(_legend(found, sides[0].scale)), ncols=n_columns, **style)

@@ -215,7 +215,8 @@ def called(what: Any, *given: Any) -> Any:
     except TypeError as error:
         if error.__traceback__ is None or error.__traceback__.tb_next is not None:
             raise  # of its own code
-        raise UserError(f"{one_line(error)}: a class gets none, a policy an observation") from error
+        needed = "a policy gets the observation" if given else "rate an object, not its class"
+        raise UserError(f"{one_line(error)}; {needed}") from error
 
 
 def is_model(path: Path) -> bool:

@@ -124,14 +124,11 @@ def seed_sentence(seeds: range, tuning: TuningSeeds) -> str:
     if tuning.elsewhere:
         names = _names(tuning.elsewhere)
         parts.append(f"the settings of {names} were tuned with other arguments of the environment")
-    if not parts and not tuning.unknown:
-        parts = [f"nothing was tuned on {these}"]
-    elif not parts and (tuning.shipped or tuning.files):
-        parts = [f"nothing is known to have been tuned on {these}"]
     if tuning.unknown:
         names = _names(tuning.unknown)
-        parts.append(f"what the study's own settings of {names} were tuned on is not known")
-    return f"{'Seeds' if len(seeds) > 1 else 'Seed'} {spans(seeds)}: {'; '.join(parts)}."
+        parts.append(f"the study's own settings of {names} may have been tuned on {these}")
+    told = "; ".join(parts) or f"nothing was tuned on {these}"
+    return f"{'Seeds' if len(seeds) > 1 else 'Seed'} {spans(seeds)}: {told}."
 
 
 def _tuned(seeds: range, found: Mapping[str, Seeds], whose: str, these: str) -> list[str]:
@@ -523,8 +520,14 @@ def why_lines(explained: Explanation) -> list[str]:
         told += [_state(state, gap) for state in worst if state.loss >= LEAST_SHARE * gap]
     elif explained.road:
         told.append(explained.road)
+    # States of one name: the one that loses most.
+    acts = {
+        one.name: f" ({one.best}, not {one.action})" * (one.best != one.action)
+        for one in reversed(explained.states)
+    }
     regained = [
-        f"{place}: {reached:.5g}, {(reached - explained.value) / gap:.1%} of the gap regained"
+        f"{place}{acts.get(place, '')}: {reached:.5g}, "
+        f"{(reached - explained.value) / gap:.1%} of the gap regained"
         for place, reached in explained.repairs
     ]
     if regained:

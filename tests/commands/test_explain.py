@@ -30,12 +30,16 @@ def run(typed, logs, tmp_path):
 def test_a_run_is_explained_in_twelve_lines_and_as_json(typed, run):
     out = typed.done("explain", run, "--json", "why.json")
     data = json.loads(Path("why.json").read_text())
-    assert len(out.splitlines()) <= 14  # which run, twelve lines, what to try
+    told, commands = out.split("to see what helps")
+    assert len(told.splitlines()) <= 13  # which run, twelve lines
     assert f"gap {data['gap']:.4g}: it returns" in out
     assert sum(part["loss"] for part in data["parts"]) == pytest.approx(data["gap"])
     assert {"name", "loss", "visits", "action", "best", "updates"} <= data["states"][0].keys()
     zipped = typed("explain", f"{run}/FrozenLake-v1.zip", "--map", "costs.png")[1]
-    assert zipped.splitlines()[1:] == [*out.splitlines()[1:], "map: costs.png"]
+    assert zipped.split("to see what helps")[0].splitlines()[1:] == told.splitlines()[1:]
+    assert zipped.endswith("\nmap: costs.png\n")
+    to_copy = commands.replace("\\\n", "").split()
+    assert f"explain {run} --json why.json --test" == " ".join(to_copy[-5:])
     assert Path("costs.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -44,9 +44,12 @@ ENDS = {  # final evaluations; how the output then ends is in the file
     "sampled": sampled(78.5, 79.0, yardstick=Yardstick(79.0, 0.0)),
     "between brackets": sampled(260.0, yardstick=POLE),
     "at an end without a proof": sampled(500.0, yardstick=UNPROVEN),
+    "at ends that differ by rounding": exact(3.0, 1.0, 3.0, 0.0, 3 - 1e-8),
     "far below the scale": exact(-1000.0, None, -11.66, -12.0),
     "without an optimum": sampled(*[487.25] * 100),
     "without a scale": exact(749.5, None, 750.0, 750.0),
+    "nearly without a scale": exact(750.0, None, 751.0, 750.0),
+    "hidden without a scale": exact(-10.0, None, -10.0, -10.0, hidden=HIDES),
     "hidden": exact(-80.0, 1 / 15, 93.8, -40.0, 35.0, hidden=HIDES),
 }
 SAID = yaml.safe_load(Path(__file__).with_name("ends_of_runs.yml").read_text(encoding="utf-8"))

@@ -209,6 +209,7 @@ def test_layers_other_layouts_and_names():
     for env_id, kwargs, place, names in (
         ("FrozenLake-v1", {}, slice(4), ("left", "down", "right", "up")),
         ("CartPole-v1", {}, slice(4), ()),
+        ("Blackjack-v1", {}, slice(4), ("stick", "hit")),
         ("Taxi-v4", {}, slice(1, 5, 3), ("north", "pick up")),
         ("WindyGridworld-v0", {"moves": "king"}, slice(3, 5), ("right", "up left")),
     ):
@@ -217,6 +218,8 @@ def test_layers_other_layouts_and_names():
     state = taxi.unwrapped.encode(0, 3, 4, 1)
     assert state_name(taxi, None, state) == "row 1, column 4, passenger on board, to G"
     assert state_name(gym.make("RiverSwim-v0"), None, 3) == "state 3"
+    hands = gym.wrappers.TimeLimit(wrappers.FlattenToDiscrete(gym.make("Blackjack-v1")), 9)
+    assert state_name(hands, None, 394) == "state 394, seen as (17, 10, 0)"
 
 
 DOCUMENT = Path(train.__file__).parent / "docs" / "evaluation.md"

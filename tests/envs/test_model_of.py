@@ -93,7 +93,7 @@ def test_a_hidden_state_is_found() -> None:
     """Taxi's published model leaves out the passenger who changes their mind."""
     found = model_of(gym.make("Taxi-v4", fickle_passenger=True), **PATIENT)
     assert optimum(found, 200) == pytest.approx(8.38, abs=5e-3)
-    assert found.notes == ["712 states stand behind 400 observations"]
+    assert found.notes == ["712 states stand behind 400 observations, so agents may return less"]
 
 
 class Tutorial(gym.Env):

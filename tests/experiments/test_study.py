@@ -273,7 +273,7 @@ def place(env_id, **kwargs):
 
 TUNED, SLIPPERY, USUAL = place("FrozenLake-v1"), place("Warehouse-v0", slip=0.1), "Warehouse-v0"
 THESE, NOTHING = "were tuned on these", "nothing was tuned on these"
-NOT_KNOWN = "what the study's own settings of mine were tuned on is not known"
+NOT_KNOWN = "the study's own settings of mine may have been tuned on these"
 ELSEWHERE = "the settings of dqn were tuned with other arguments of the environment"
 # Agents, environments, the first seed and how many there are, and what is said of them.
 SEEDS = [
@@ -282,7 +282,7 @@ SEEDS = [
     # The constructor's defaults were tuned on nothing.
     ((PLAIN_DQN,), [TUNED], (0, 10), NOTHING),
     ((MINE,), [TUNED], (0, 10), f"the shipped settings of dqn {THESE}; {NOT_KNOWN}"),
-    ((MINE,), [TUNED], (1000, 10), f"nothing is known to have been tuned on these; {NOT_KNOWN}"),
+    ((MINE,), [TUNED], (1000, 10), f"Seeds 1000 to 1009: {NOT_KNOWN}"),
     # Other arguments of the environment make it another.
     ((DQN,), [SLIPPERY], (1000, 10), f": {ELSEWHERE}"),
     ((DQN,), [place(USUAL, slip=0.0)], (0, 10), f"the shipped settings of dqn {THESE}"),

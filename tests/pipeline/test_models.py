@@ -69,7 +69,7 @@ def test_which_model_of_which_run(tmp_path):
     for wanted, said in (
         (Wanted(**found, number=5), "no run 5 of a2c on CartPole-v1 in .*: there is 1, 2"),
         (Wanted(**found, which=30), "no rl_model_30_steps.zip: there are checkpoints after 20, 40"),
-        (Wanted(algo="dqn", log_folder=tmp_path), "no run of dqn on CartPole-v1"),
+        (Wanted(algo="dqn", log_folder=tmp_path), "CartPole-v1 --algo dqn makes one"),
         (Wanted(algo="dnq", log_folder=tmp_path), "unknown agent 'dnq'"),
         (Wanted(tmp_path / "none.zip"), r"none\.zip: no such file"),
         (Wanted(runs[0].path / "run.json"), "run.json is no agent's zip: it is no whole zip: "),

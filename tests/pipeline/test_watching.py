@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from rl_yardstick.agents import load_algorithm
-from rl_yardstick.pipeline import callbacks, watching
+from rl_yardstick.pipeline import callbacks, pictures, watching
 from rl_yardstick.pipeline.callbacks import ProgressCallback
 from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.errors import UserError
@@ -134,6 +134,16 @@ def test_a_map_worked_by_hand():
     assert found.differs.tolist() == [False, True, False, True, False, False]
     assert found.visited.tolist() == [True, True, False, False, False, False]
     assert found.optimal_visited.tolist() == [True, True, True, False, False, False]
+
+
+def test_the_picture_of_costs_has_the_scales_of_both_maps(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(pictures, "write_png", lambda figure, path: drawn.append(figure))
+    found = map_of(THERE_AND_BACK, **CORNER)
+    pictures.draw_cost_map("costs.png", "costs", found, np.eye(6)[1])
+    labels = [axes.get_ylabel() for axes in drawn[0].axes[2:]]
+    assert labels == ["expected return from here on", "share of the gap, in per cent"]
+    assert [axes.get_ylim() for axes in drawn[0].axes[2:]] == [(97, 100), (0, 100)]
 
 
 def test_an_action_among_several_best_ones_does_not_differ():

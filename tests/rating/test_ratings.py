@@ -3,8 +3,10 @@
 import itertools
 import json
 import pickle
+import re
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -17,6 +19,7 @@ from stable_baselines3 import PPO
 from rl_yardstick import Run, mdp, rate
 from rl_yardstick.envs import known_models
 from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.report.words import why_lines
 from tests.pipeline.short_runs import trained
 
 LAKE, DRY, POLE = "FrozenLake-v1", {"is_slippery": False}, "CartPole-v1"
@@ -151,6 +154,17 @@ def test_hands_of_blackjack_in_every_form():
     stands = (known_models.observations_of_states(env)[:, 0] < 18).astype(int)
     exact = mdp.policy_return(known_models.transition_model(env), stands, 1000).expected_return
     assert found == {round(exact, 12)}
+    *_, repairs = why_lines(rate(lambda hand: int(hand[0] < 17), "Blackjack-v1").explanation)
+    told = "with the best action at each step in state 362, seen as (16, 5, 0) (stick, not hit): "
+    assert repairs.startswith(told)
+
+
+def test_the_page_on_ratings_makes_the_table_that_it_rates(tmp_path, monkeypatch):
+    page = Path("docs/rate.md").resolve().read_text()
+    monkeypatch.chdir(tmp_path)
+    exec(re.search('python -c "(.*)"', page)[1], {})  # noqa: S102  # a page of this project
+    found = rate("q_table.npy", LAKE)
+    assert "\n".join([*found.notes, found.map, found.explanation.ending]) in page
 
 
 REFUSED = {
@@ -163,8 +177,8 @@ REFUSED = {
     "named actions": ({s: {"left": 0.0, "up": 0.0} for s in range(16)}, "the key (0, 'left'), "),
     "nan in pandas": (pd.DataFrame(np.eye(16, 4)).replace(1, np.nan), "nan in states [0, 1, 2, 3]"),
     "a state twice": (pd.DataFrame(np.eye(16, 4), index=[0] * 16), "several rows of one state"),
-    "a class to be given something": (type("A", (), {"__init__": lambda self, env: 0}), "'env'"),
-    "a function of two": (lambda state, values: 0, "'values': a class gets none, a policy"),
+    "a class to be given something": (type("A", (), {"__init__": lambda self, env: 0}), "'env'; "),
+    "a function of two": (lambda state, values: 0, "'values'; a policy gets the obs"),
     "keys of two kinds": ({0: [0] * 4, (1, 2): [0] * 4}, "no state of FrozenLake-v1"),
     "hands": (hands(), "[4, 1, 0] is not in Discrete(16)"),
     "ragged": ([[1, 2], [3]], "holds no table"),

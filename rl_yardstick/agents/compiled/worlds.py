@@ -424,7 +424,7 @@ def _finite_model(env: Env) -> FiniteModel:
         names = ", ".join(sorted(wrapper.__name__ for wrapper in watching))
         raise NotCompilable(f"{names} must see every step")
     if check is None:
-        raise NotCompilable("the environment publishes no model")
+        raise NotCompilable("the model was found by a search, not published")
     if not check.state_can_be_set:
         raise NotCompilable("the environment does not continue from the state that s is set to")
     monitor = monitor_of(env)

@@ -113,7 +113,7 @@ def model_of(
         notes.append(f"{names} counts the steps: episodes end after {search.horizon}")
     n, seen = len(search.observations), len(set(map(state.by_value, search.observations)))
     if seen < n:
-        notes.append(f"{n:,} states stand behind {seen:,} observations")
+        notes.append(f"{n:,} states stand behind {seen:,} observations, so agents may return less")
     if illegal := search.illegal:
         others = f", and {len(illegal) - 1:,} others" * (len(illegal) > 1)
         told = f"{sum(illegal.values()):,} of the pairs of state and action are not allowed"
