@@ -75,7 +75,8 @@ def impossible(env: gym.Env[Any, Any], found: FoundModel) -> str:
         number = numbers.get(name_of(observation))
         return None if number is None else min(time, times - 1) * len(numbers) + number
 
-    problem = refutation(env, found.model, state_of, found.actions, found.mask, seed=1)
+    actions = [*range(found.model.n_actions)]
+    problem = refutation(env, found.model, state_of, actions, found.mask, seed=1)
     return problem or "0 of 40,000"
 
 

@@ -27,7 +27,7 @@ import torch as th
 
 from rl_yardstick.diagnosis.audit import Verdict, audit
 from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject, Subject
-from rl_yardstick.pipeline.components import agent_name, import_modules, module_name
+from rl_yardstick.pipeline.components import class_name, import_modules, module_name
 from rl_yardstick.pipeline.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,7 +55,7 @@ def subject_of(path: Path) -> Subject:
     own = [each for each in learn if each.__module__ == module_name(str(path))]
     typed = f"{path}:{own[-1].__name__}"
     import_modules([typed])
-    return ClassSubject(agent_name(typed), {})
+    return ClassSubject(class_name(typed), {})
 
 
 def audited(path: Path) -> Verdict:

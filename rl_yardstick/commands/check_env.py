@@ -31,7 +31,6 @@ def main() -> int:
     """Print the findings; return 1 if one of them breaks trainings."""
     args, begin = build_parser().parse_args(), time.monotonic()
     cli.import_typed(args)
-    cli.register_typed(args)
     from rl_yardstick.diagnosis.environment_checks import LATE, examine
     from rl_yardstick.pipeline.environments import make_env
     from rl_yardstick.pipeline.settings import parse_assignments

@@ -269,40 +269,23 @@ def shared(*names: str, **changes: Any) -> list[Flag]:
 def import_typed(args: argparse.Namespace) -> None:
     """Import the modules of ``--gym-packages``, ``--env module:Id-v0`` and ``--algo module:Class``.
 
-    ``args.env`` is one id, a list of ids, or None, and is left without modules; agents are named
-    ``module.Class``.
+    ``args.env`` is one id, a list of ids, or None, and is left without modules; classes, also of
+    ``--env``, are named ``module.Class``.
     """
-    from rl_yardstick.pipeline.components import agent_name, import_modules, split_id
+    from rl_yardstick.pipeline.components import class_name, import_modules, split_id
 
     for key in [key for key in ("env", "algo", "algos") if getattr(args, key, None)]:
         given = getattr(args, key)
         words = given if isinstance(given, list) else [given]
         typed = [split_id(word)[0] if key == "env" else word for word in words if ":" in word]
         args.gym_packages = [*args.gym_packages, *filter(None, typed)]
-        names = [split_id(word)[1] if key == "env" else agent_name(word) for word in words]
+        names = [split_id(word)[1] if key == "env" else class_name(word) for word in words]
         setattr(args, key, names if isinstance(given, list) else names[0])
     import_modules(args.gym_packages)
     if "exact_model" in args:
         from rl_yardstick.envs import found_models
 
         found_models.limit(args.exact_model or "auto")
-
-
-def register_typed(args: argparse.Namespace) -> None:
-    """Register the class of ``--env module:Class``, or a function that makes an environment."""
-    from gymnasium.envs.registration import EnvSpec, registry
-
-    from rl_yardstick.pipeline.components import module_name
-
-    if args.env in registry or not args.gym_packages:
-        return
-    name = module_name(args.gym_packages[-1])
-    if callable(kind := getattr(sys.modules.get(name), args.env, None)):
-        if any(spec.name == args.env for spec in registry.values()):
-            args.env = f"{name}.{args.env}"  # else it would be the other one's newest version
-        registry[args.env] = EnvSpec(args.env, kind)
-    elif args.env.isidentifier():
-        raise UserError(f"{args.gym_packages[-1]} has no class {args.env!r}")
 
 
 def check_alone(

@@ -38,7 +38,6 @@ def main() -> int:
     """Print the optimum."""
     args = build_parser().parse_args()
     cli.import_typed(args)
-    cli.register_typed(args)
     from rl_yardstick.envs import found_models
 
     found_models.limit(args.exact_model, args.ignore, args.starts)

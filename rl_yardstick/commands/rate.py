@@ -28,7 +28,7 @@ examples:
   python -m rl_yardstick rate script.py:policy --env Blackjack-v1   # its code runs
 
 Files are read as data; a script runs, because you typed its name. Exit code: 0, also if some of
-several files cannot be rated; 2 if the only one cannot.
+several files cannot be rated; 2 if none can.
 """
 
 
@@ -49,7 +49,7 @@ def build_parser() -> OneLineParser:
 
 
 def main() -> int:
-    """Rate files."""
+    """Rate files; return 2 if none could be rated."""
     args = build_parser().parse_args()
     cli.import_typed(args)
     from rl_yardstick.pipeline.files import write_text
@@ -73,7 +73,7 @@ def main() -> int:
         write_text(args.table, frame.to_csv(index=False, lineterminator="\n"))
     told = {k: one if isinstance(one, str) else one.as_data() for k, one in rated.items()}
     cli.write_result(args, told)
-    return 0
+    return 2 * all("environment" not in row for row in rows)
 
 
 def _ratings(args: Any) -> dict[str, Rating | str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from functools import partial
@@ -15,6 +16,7 @@ from rl_yardstick.commands import cli, terminal
 from rl_yardstick.commands.cli import Flags, OneLineParser, flag, several, shared, switch
 from rl_yardstick.commands.terminal import APART, percent, say
 from rl_yardstick.pipeline.errors import Stopped, UserError
+from rl_yardstick.pipeline.files import read_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,6 +35,7 @@ WATCHED = cli.whole_number(1, besides={0: "the steps in which its policy improve
 # Flags that may stand beside --resume: none of the training itself.
 _BESIDE_RESUME = {"resume", "log_folder", "gym_packages", "verbose", "progress", "track"}
 _BESIDE_RESUME |= {"wandb_project_name", "wandb_entity", "wandb_group", "wandb_tags"}
+_OF_RIVAL = ("env_kwargs", "n_timesteps", "n_episodes", "conf_file")  # flags of `next_commands`
 
 EPILOG = """\
 examples:
@@ -247,6 +250,10 @@ def resume(run: Run, args: argparse.Namespace) -> int:
     check_typed(spec.gym_packages, args.gym_packages, str(run.path))
     check_code(spec, str(run.path))
     cli.check_installed(args.track, "--track", "wandb", "wandb", "tensorboard")
+    with suppress(UserError, ValueError):  # a run of a study has another command
+        words = shlex.split(read_text(run.path / spec.env_name / "command.txt"))
+        first = build_parser().parse_args(words[2:])
+        vars(args).update(cli.given(first, _OF_RIVAL))
     log = spec.tensorboard_log or (TRACKED if args.track else None)
     spec = spec.changed(gym_packages=args.gym_packages, tensorboard_log=log)
     return carry_out(spec, run, args, resumes=True)
@@ -381,7 +388,7 @@ def next_commands(run: Run, spec: TrainSpec, explained: bool, args: Any) -> list
     labels, typed = (("watch    ", "enjoy"), ("explain  ", "explain")), args.gym_packages
     told = [f"{label}{cli.to_copy(name, run.path, typed=typed)}" for label, name in labels]
     told = told[: 1 + explained]
-    if spec.env_kwargs and not args.env_kwargs:  # of a file, or typed before the run was resumed
+    if spec.env_kwargs and not args.env_kwargs:  # of a file, or of a study
         return told
     more = ["--env-kwargs", *args.env_kwargs] if args.env_kwargs else []
     more += ["--n-timesteps", args.n_timesteps] if args.n_timesteps > 0 else []

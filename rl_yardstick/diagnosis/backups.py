@@ -283,6 +283,8 @@ class Measured(NamedTuple):
 
     def words(self) -> str:
         """The target in a line, and what would be right where it is not."""
+        if max(map(abs, self[:-1])) > 10:
+            return "target = no sum of reward and next value"
         shown, other = [], []
         for found, (part, right), is_off in zip(self, PARTS.items(), self.off(), strict=False):
             if is_off or right:

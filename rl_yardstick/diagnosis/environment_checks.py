@@ -130,7 +130,8 @@ def _lengths(steps: list[trial.Step]) -> set[int]:
 
 def _shows_end(env: Any) -> bool:
     """Whether one number of the observation is the same at all ends, and never before."""
-    before, ends, is_over, seen = [], [], True, None
+    before, ends = list[Any](), list[Any]()
+    seen, is_over = None, True
     while len(ends) < 20:
         seen = env.reset()[0] if is_over else seen
         before.append(spaces.flatten(env.observation_space, seen))

@@ -250,9 +250,6 @@ class Found:
         split: GapByState,
         learner: tuple[TrainSpec, BaseAlgorithm] | None,
     ) -> None:
-        from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
-        from rl_yardstick.agents.policies import own_values
-
         self.evaluator, self.split, self.policy = evaluator, split, policy
         self.model, self.horizon = evaluator.model, evaluator.horizon
         self.place = partial(state_name, env, evaluator.layout)
@@ -272,6 +269,9 @@ class Found:
         self.task = None if learner is None else _task(*learner, evaluator)
         if learner is None:
             return
+        from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
+        from rl_yardstick.agents.policies import own_values
+
         self.agent: Any = learner[1]
         if not isinstance(self.agent, SoftmaxAlgorithm):
             self.beliefs = own_values(self.agent, evaluator.observations)

@@ -27,9 +27,9 @@ from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 from pydantic import Field, TypeAdapter, ValidationError
 
-from rl_yardstick.agents.own_classes import SMALLEST
 from rl_yardstick.agents.registry import ALGORITHMS, BY_VALUE, add_class
 from rl_yardstick.pipeline.errors import (
     UserError,
@@ -93,20 +93,22 @@ def split_class(typed: str) -> tuple[str, str]:
     return (module, cls) if module and cls.isidentifier() else (typed, "")
 
 
-def agent_name(typed: str) -> str:
-    """The name ``module.Class`` of an agent whose class is typed; or else that of the module."""
+def class_name(typed: str) -> str:
+    """The name ``module.Class`` of a class that is typed; or else that of the module."""
     cls = split_class(typed)[1]
     return f"{module_name(typed)}.{cls}" if cls else module_name(typed)
 
 
 def _register(typed: str, cls: str, inside: dict[str, Any]) -> None:
-    if cls not in inside:
+    """Register a class as an agent, or as an environment if it cannot be trained."""
+    if cls not in inside and cls not in gym.registry:  # an id without a version
         known = [name for name, value in inside.items() if isinstance(value, type)]
         raise unknown(f"{typed}: there is no class", cls, known)
+    name, place = class_name(typed), f"{module_name(typed)}:{cls}"
     try:
-        add_class(agent_name(typed), inside[cls])
-    except ValueError as error:
-        raise UserError(str(error), SMALLEST if isinstance(inside[cls], type) else "") from error
+        add_class(name, inside.get(cls))
+    except ValueError:  # where it is asked for as an agent, `settings.check_agent` has the reason
+        gym.registry[name] = gym.registry.get(cls) or EnvSpec(name, place)
 
 
 def _import_file(path: Path) -> None:
@@ -153,24 +155,24 @@ def digests_of(typed: Iterable[str], *names: str) -> dict[str, str]:
 
 def check_code(spec: TrainSpec, where: str) -> None:
     """Raise UserError if the user's classes are not there, or have changed since a training."""
-    if spec.algo not in ALGORITHMS or spec.env_id not in gym.registry:
-        fault = "was begun in Python, with classes of a script or notebook"
-        raise UserError(f"{where} {fault}: the same call of compare there continues a study")
     here = digests_of(spec.gym_packages)
     if changed := [name for name in here if spec.code.get(name, here[name]) != here[name]]:
         raise UserError(f"{where} was begun with other code of {', '.join(changed)}")
+    if spec.algo not in ALGORITHMS or spec.env_id not in gym.registry:
+        fault = "was begun in Python, with classes of a script or notebook"
+        raise UserError(f"{where} {fault}: the same call of compare there continues a study")
 
 
 def split_id(env_id: str) -> tuple[str, str]:
-    """The module and the id in ``module:Env-v0``, Gymnasium's form; an empty module without it."""
+    """What to import for ``module:Env-v0``, Gymnasium's form, or ``module:Class``; and the id."""
     module, _, name = env_id.rpartition(":")
-    return module, name
+    return (env_id, class_name(env_id)) if split_class(env_id)[1] else (module, name)
 
 
 def check_typed(recorded: Iterable[str], typed: Iterable[str], where: str) -> None:
     """Raise UserError if a module that a file names is missing among those that were typed."""
-    known = {name(one) for one in typed for name in (agent_name, module_name)}
-    missing = [name for name in recorded if agent_name(name) not in known]
+    known = {name(one) for one in typed for name in (class_name, module_name)}
+    missing = [name for name in recorded if class_name(name) not in known]
     if missing:
         what = f"was made with modules of yours: add --gym-packages {' '.join(missing)}"
         raise UserError(f"{where} {what}")

@@ -327,15 +327,16 @@ def training_follows(
 def check_agent(algo: str) -> None:
     """Raise UserError if there is no such agent, or a package that it needs is missing."""
     entry = ALGORITHMS.get(algo)
+    module, _, name = algo.rpartition(".") if entry is None else entry.entry_point.partition(":")
+    cls = getattr(sys.modules.get(module), name, None)  # imported already if it is the user's
+    if cls is not None and (fault := fault_of(cls)):
+        what = algo if entry is None else f"{algo}: {entry.entry_point}"
+        raise UserError(f"{what} {fault}", SMALLEST if isinstance(cls, type) else "")
     if entry is None:
         raise unknown("unknown agent", algo, ALGORITHMS)
     if not entry.is_installed:
         fault = f"{entry.package}, which is not installed: {entry.install_command}"
         raise UserError(f"{algo} needs {fault}")
-    module, _, name = entry.entry_point.partition(":")
-    cls = getattr(sys.modules.get(module), name, None)  # imported already if it is the user's
-    if cls is not None and (fault := fault_of(cls)):
-        raise UserError(f"{algo}: {entry.entry_point} {fault}", SMALLEST)
 
 
 def special_settings(entry: Mapping[str, Any]) -> dict[str, Any]:

@@ -79,7 +79,7 @@ class TrainSpec(BaseModel):
     @property
     def place(self) -> str:
         """The environment for titles, with the file of its map."""
-        return f"{self.env_name} ({self.map_name})" if self.map_name else self.env_name
+        return f"{self.env_id} ({self.map_name})" if self.map_name else self.env_id
 
     @property
     def title(self) -> str:

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 
 from rl_yardstick.agents import ALGORITHMS
 
@@ -46,6 +47,59 @@ def test_a_run_does_not_have_modules_imported(typed, own_folder, monkeypatch, tm
         assert "my_agents" not in sys.modules
     words = ["--gym-packages", own_folder / "my_agents.py"]
     typed.done("enjoy.py", *by_path, *PLAY, *words)
+
+
+BRIDGE = """
+import gymnasium
+
+
+class Bridge(gymnasium.Env):
+    def __init__(self, length=4):
+        self.observation_space, self.length = gymnasium.spaces.Discrete(length), length
+        self.action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.cell = self.steps = 0
+        return 0, {}
+
+    def step(self, action):
+        self.cell, self.steps = max(self.cell + 2 * int(action) - 1, 0), self.steps + 1
+        return self.cell, -1.0, self.cell == self.length - 1, self.steps == 20, {}
+
+
+def long(length=9):
+    return Bridge(length)
+
+
+gymnasium.register("Short", "bridges:Bridge", kwargs={"length": 3})
+"""
+
+
+def test_every_command_takes_a_class_as_an_environment(typed, own_folder, in_this_process):
+    """Also a function that makes one, and an id without a version."""
+    (own_folder / "bridges.py").write_text(BRIDGE)
+    bridge, run = ["--env", "bridges.py:Bridge"], "logs/qlearning/bridges.Bridge_1"
+    out = typed.done("train.py", *bridge, "--algo", "qlearning", "--seed", "0", "-n", "400")
+    assert "qlearning on bridges.Bridge, seed 0, 400 steps" in out
+    assert "return -3 of -3" in out
+    told = " ".join(out.replace("\\\n", "").split())
+    assert f"{run} --gym-packages bridges.py:Bridge" in told
+    assert "add --gym-packages bridges.py:Bridge" in typed.refused("enjoy.py", run, *PLAY)
+    np.save("right.npy", np.ones(4, int))
+    assert "return -3" in typed.done("yardstick", "rate", "right.npy", *bridge)
+    for words in ([*bridge, "--algo", "qlearning"], [run, *bridge]):
+        assert "return -3" in typed.done("enjoy.py", *words, *PLAY)
+        assert "it returns -3" in typed.done("yardstick", "explain", *words)
+    few = ["-n", "60", "--no-report", "--name", "few"]
+    typed.done("compare.py", *bridge, "--algos", "qlearning", "random", "--seeds", "2", *few)
+    again = ["--resume", "logs/studies/few", "--gym-packages", "bridges:Bridge", "--no-report"]
+    assert "4 of them there already" in typed.done("compare.py", *again)
+    few = [*few[:-1], "search", "--trials", "2", "--seeds-per-trial", "1", "--retest", "0"]
+    typed.done("tune.py", *bridge, "--algo", "qlearning", *few)
+    for name, optimum in (("bridges:long", -8), ("bridges:Short", -2)):
+        assert f"optimum   {optimum}\n" in typed.done("yardstick", "optimum", "--env", name)
+    assert "bridges.Bridge lacks act" in typed("train.py", "--algo", "bridges:Bridge")[2]
 
 
 NAMES = ("agents", "envs", "experiments", "pipeline", "mdp", "report", "models")

@@ -107,7 +107,7 @@ def test_a_run_with_its_page_and_a_run_from_its_model(typed, tmp_path):
 
 def test_scripts_that_a_queue_starts_again(typed, tmp_path):
     words = ["train.py", *LAKE, "-n", "300", "--seed", "1", "--resume-or-start"]
-    typed.done(*words)
+    first = typed.done(*words)
     assert "is finished already" in typed.done(*words)
     assert len(list((tmp_path / "logs" / "qlearning").iterdir())) == 1
     record = tmp_path / "logs/qlearning/FrozenLake-v1_1/run.json"
@@ -115,6 +115,10 @@ def test_scripts_that_a_queue_starts_again(typed, tmp_path):
     typed.done(*words)
     assert json.loads(record.read_text())["state"] == "finished"
     assert "is finished already" in typed.refused("train.py", "--resume", record.parent)
+    record.write_text(record.read_text().replace('"finished"', '"running"'))
+    resumed = typed.done("train.py", "--resume", record.parent)
+    assert resumed.splitlines()[-1] == first.splitlines()[-1]
+    assert resumed.endswith("--n-timesteps 300\n")
 
 
 def test_a_signal_ends_a_command_and_tells_how_to_resume(typed, tmp_path):

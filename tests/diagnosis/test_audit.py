@@ -4,11 +4,11 @@ import pytest
 
 from rl_yardstick.diagnosis.audit import audit
 from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject
-from rl_yardstick.pipeline.components import agent_name, import_modules
+from rl_yardstick.pipeline.components import class_name, import_modules
 from tests.diagnosis.planted import FAULTS, PROGRAMS, text_of
 
 # Rows of networks in scripts take half a minute; benchmarks/audit_faults.py has them.
-QUICK = [row for row in FAULTS if row[0].startswith("sb3") or FAULTS.index(row) in (3, 13)]
+QUICK = [row for row in FAULTS if row[0].startswith("sb3") or FAULTS.index(row) in (3, 13, 17, 18)]
 QUICK += [row for row in FAULTS if row[0] == "sarsa"][:1]
 
 
@@ -25,7 +25,7 @@ def verdict_on(tmp_path):
             exec(path.read_text(), inside)  # noqa: S102
             return audit(ScriptSubject(name, inside[name], {}), seeds=1)
         import_modules([f"{path}:{name}"])
-        return audit(ClassSubject(agent_name(f"{path}:{name}"), {}), seeds=1)
+        return audit(ClassSubject(class_name(f"{path}:{name}"), {}), seeds=1)
 
     return on
 
@@ -44,6 +44,23 @@ def test_right_programs_pass(program, verdict_on):
     assert found.exit_code == 0, found.lines()
     assert found.target.startswith("target = 1.00 reward + 0.")
     assert "right would be" not in found.target
+
+
+OWN_RULES = {
+    "its own mix": ("(1 - self.tau).add_(self.tau * new)", "(0.97).add_(0.03 * new)"),
+    "its own loss": ("smooth_l1_loss(q, target)", "th.log(th.cosh(q - target)).mean()"),
+}
+
+
+@pytest.mark.parametrize("name", OWN_RULES)
+def test_rules_of_its_own_are_right_if_it_learns_what_is_right(name, verdict_on):
+    assert verdict_on("sb3_dqn", *OWN_RULES[name], f"_own_{name[-4:].strip()}").state == "right"
+
+
+def test_a_wrong_action_in_some_states_is_no_exploration(verdict_on):
+    asked = "return int(q[obs].argmax())"
+    found = verdict_on("table", asked, f"{asked} if obs != 13 else int(q[obs].argmin())")
+    assert (found.state, found.fault) == ("wrong", "")
 
 
 @pytest.mark.parametrize("name", ["dqn", "double_dqn", "deep_qlearning", "ppo", "a2c", "qlearning"])

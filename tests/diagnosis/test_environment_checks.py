@@ -123,8 +123,8 @@ class Plain:
         (["odd.py:Sized"], 2, "Sized: Sized.__init__() missing 1 required positional argument: 's"),
         (["odd.py:Sized", "--env-kwargs", "sise:3"], 2, "Sized: unknown argument 'sise': did you"),
         (["odd.py:Plain"], 2, "Plain: The environment must inherit from the gymnasium.Env class"),
-        (["odd.py:None"], 2, "odd.py has no class 'None'"),
-        (["elsewhere:Lake"], 2, "elsewhere: no module named elsewhere"),
+        (["odd.py:None"], 2, "odd.py:None: there is no class 'None'"),
+        (["elsewhere:Lake"], 2, "elsewhere:Lake: no module named elsewhere"),
     ],
 )
 def test_what_is_typed(typed, own_folder, monkeypatch, words, code, line):

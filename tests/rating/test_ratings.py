@@ -230,6 +230,8 @@ def test_tables_need_no_pytorch_and_files_run_nothing(tmp_path, typed, monkeypat
     assert json.loads((tmp_path / "marks.json").read_text())["class/hf.pkl"]["score"] > 0.9
     assert not (tmp_path / "mark").exists()
     assert max(map(len, out.splitlines())) <= 80
+    none_rated = typed("yardstick", "rate", "class/evil.pkl", "class/evil.pkl", "own.npy", *words)
+    assert (none_rated[0], "2 of 2 could not be rated" in none_rated[1]) == (2, True)
     (tmp_path / "own.py").write_text("policy = lambda state: 2\nright = lambda obs: 1\n")
     out = typed.done("yardstick", "rate", "own.py:policy", "--env", LAKE)
     assert ("score 0 " in out, "standard error" in out) == (True, False)
