@@ -219,11 +219,7 @@ def test_commands_take_it(typed, own_folder, in_this_process):
     assert typed("train.py", *words, *algo, *zipped)[::2] == (0, "")
     words += ["--algos", "random", "mine:Table", "mine:Mine", "--seeds", "2", "--no-report"]
     assert "mine.Table                 undecided" in typed.done("compare.py", *words)
-
-
-def test_audit_takes_it(typed, own_folder):
-    words = ("--algo", "mine:Table", "--kind", "q_learning", "--seeds", "1")
-    out = typed.done("yardstick", "audit", *words)
+    out = typed.done("yardstick", "audit", *algo, "--kind", "q_learning", "--seeds", "1")
     assert out.endswith("0.80 value where cut off\nright\n")
 
 

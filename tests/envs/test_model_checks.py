@@ -164,8 +164,7 @@ def test_the_caller_notices_nothing():
 
 
 def test_an_environment_that_cannot_be_copied_is_made_anew():
-    env = gym.make("Locked-v0", true=outcomes(wind=0.5))
-    assert model_check(env).refusal is None
+    assert model_check(gym.make("Locked-v0", true=outcomes(wind=0.5))).refusal is None
     assert "which raised TypeError: cannot pickle" in model_check(Locked()).refusal
 
 

@@ -14,20 +14,11 @@ from rl_yardstick.experiments.results import RunResults
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.settings import read_entry, read_yaml, seeds_tuned_on
 from rl_yardstick.tuning import retesting, searching
-from rl_yardstick.tuning.searching import (
-    FAILURE,
-    RUNS,
-    SETTINGS,
-    RunOutcome,
-    is_hopeless,
-    open_storage,
-    outcome_of,
-    outcomes_of,
-)
+from rl_yardstick.tuning.searching import RUNS, SETTINGS, RunOutcome, outcomes_of
 from rl_yardstick.verdicts import Estimate, steps_to_threshold
 from tests.experiments.test_growing import results_of
 
-REAL_OUTCOME_OF, REAL_STORAGE = outcome_of, open_storage
+REAL_OUTCOME_OF, REAL_STORAGE = searching.outcome_of, searching.open_storage
 TABLES = read_yaml(Path(__file__).with_name("searches.yml"))
 
 
@@ -106,7 +97,7 @@ def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy):
     for trial in search.trials:
         fails = trial.user_attrs[SETTINGS]["gamma"] > 0.9
         assert trial.state.name == ("PRUNED" if fails else "COMPLETE")
-        assert (FAILURE in trial.user_attrs) == fails
+        assert (searching.FAILURE in trial.user_attrs) == fails
     # Where nothing but failures comes of it, it ends and says why.
     with pytest.raises(UserError, match=r"all of the first 5 trials failed; seed \d: it broke"):
         toy.search(toy.opened(name="failing"), failing=lambda run: True)
@@ -171,7 +162,9 @@ def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value, steps):
 def test_what_is_hopeless(scores, others, options, hopeless):
     if "value" in options:
         options = {"value": statistics.median}
-    found = is_hopeless(dict(enumerate(scores)), [dict(enumerate(o)) for o in others], **options)
+    found = searching.is_hopeless(
+        dict(enumerate(scores)), [dict(enumerate(o)) for o in others], **options
+    )
     assert found is hopeless
 
 
