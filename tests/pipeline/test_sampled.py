@@ -19,7 +19,6 @@ from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, Yardstick
 from rl_yardstick.pipeline.models import load
 from tests.pipeline.short_runs import CART, LAKE, Steady, agent_of, run_of, spec_of
 
-CAR = "MountainCar-v0"
 PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
 
 
@@ -143,7 +142,7 @@ SMALL = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [16]}}
     [
         ("double_qlearning", CART, IN_BINS, {}),
         ("reinforce", CART, None, WIDTHS),
-        ("dqn", CAR, None, SMALL),
+        ("dqn", "MountainCar-v0", None, SMALL),
     ],
 )
 def test_compiled_play_is_the_same_to_the_bit(monkeypatch, algo, env_id, wrapper, settings):
