@@ -236,8 +236,7 @@ def test_linear_thompson_samples_from_the_posterior():
 def test_one_hot_contexts_are_averages_with_a_ridge():
     model = agent("linucb", 2)
     for row, arm, reward in ((0, 1, 1.0), (0, 1, 1.0), (1, 2, 4.0)):
-        context = model._contexts(np.array([row]))[0]
-        model._learn(Pull(context.tolist(), arm, reward, 1.0))
+        model._learn(Pull(model._contexts(np.array([row]))[0].tolist(), arm, reward, 1.0))
     assert model.policy.coefficients.tolist() == [[0, 0], [2 / 3, 0], [0, 2]]
     assert model.predict(np.array([0, 1]), deterministic=True)[0].tolist() == [1, 2]
 

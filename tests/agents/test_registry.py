@@ -1,7 +1,7 @@
 """The table of agents: where they live, what spaces they fit, and how others are added."""
 
 import importlib.util
-import math
+from pathlib import Path
 from unittest.mock import patch
 
 import gymnasium as gym
@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from rl_yardstick import agents
 from rl_yardstick.agents import ALGORITHMS, fitting_algorithms, load_algorithm
 from rl_yardstick.pipeline.components import constructor_parameters
+from rl_yardstick.pipeline.settings import read_yaml
 from tests.agents.hand_fed import Spaces
 
 DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))
@@ -124,55 +125,12 @@ def test_a_name_is_registered_once(name):
     assert before == ALGORITHMS
 
 
-INF, NAN = math.inf, math.nan
-TWO = {"initial_q_std": 1e308, "seed": 0}  # one of the numbers that are drawn is above 1.8
-EXPONENTIAL = {"exploration_decay": "exponential", "exploration_final_eps": 0.0}
-VECTORS = {"env": Spaces(spaces.Box(-1, 1, (4,)))}
-MATRICES = {"env": Spaces(spaces.Box(-1, 1, (2, 2)))}
-NO_MASKS = r"^mask_actions: the environment has no method action_masks\(\)"
-NOISY, UNDISCOUNTED = {"exploration": "gaussian_noise"}, {"gamma": 1.0, "value_bound": 1.0}
 REFUSED = [
-    ("qlearning", {"gamma": 1.5}, "gamma must lie between 0 and 1"),
-    ("qlearning", TWO, "initial_q and initial_q_std must give finite values"),
-    ("qlearning", {"exploration": "greedy"}, "exploration must be one of epsilon_greedy"),
-    ("qlearning", {"learning_rate": "average"}, "learning_rate must be a number"),
-    ("qlearning", {"learning_rate": -0.1}, "learning_rate must be at least 0, not -0.1"),
-    ("qlearning", {"learning_rate": INF}, "learning_rate must be finite, not inf"),
-    ("qlearning", {"exploration": "boltzmann", "temperature": 0.0}, "temperature must be above 0"),
-    ("qlearning", EXPONENTIAL, "start and end above 0"),
-    ("qlearning", {"engine": "fast"}, "one of auto, compiled, interpreted, not 'fast'"),
-    ("qlearning", {"env": "CartPole-v1"}, "Discrete space that starts at 0"),
-    ("qlearning", {"mask_actions": True}, NO_MASKS),
-    ("expected_sarsa", NOISY, "take epsilon_greedy or boltzmann"),
-    ("n_step_tree_backup", {"n_steps": 0}, "n_steps must be a whole number of at least 1, not"),
-    ("n_step_tree_backup", {"n_steps": True}, "n_steps must be a whole number of at least 1, not"),
-    ("n_step_tree_backup", NOISY, "target_policy: exploring needs the probabilities"),
-    ("off_policy_monte_carlo", {"learning_rate": 0.1}, "must be 'sample_average', not 0.1"),
-    ("off_policy_monte_carlo", NOISY, "needs the probabilities of the actions"),
-    ("dyna_q", {"planning_steps": -1}, "planning_steps must be a whole number of at least 0"),
-    ("q_lambda", {"skip_terminal_update": True}, "is for the agents that learn from"),
-    ("r_max", UNDISCOUNTED, "gamma must be below 1"),
-    ("r_max", {"known_after": 10**30}, "known_after must be at most 1000000000, not 1000"),
-    ("qlearning_ucb", {"gamma": 1.0}, "value_bound has to be given where gamma is 1"),
-    ("qlearning_ucb", UNDISCOUNTED, "horizon has to be given where gamma is 1"),
-    ("reinforce", {"initial_preferences": [1, 2, 3]}, "must be a number or 4 numbers"),
-    ("reinforce", {"initial_preferences": INF}, "initial_preferences must be finite, not inf"),
-    ("reinforce", {"learning_rate": "sample_average"}, "must be a number or a schedule"),
-    ("epsilon_greedy", {"learning_rate": "averge"}, "a schedule or 'sample_average', not 'averge'"),
-    ("ucb", VECTORS, "observations in a Discrete space"),
-    ("ucb", {"mask_actions": True}, NO_MASKS),
-    ("kl_ucb", {"c": NAN}, "c must be at least 0, not nan"),
-    ("exp3", {"mixing": 0.0}, "mixing must be above 0, not 0.0"),
-    ("exp3", {"mixing": 1.1}, "mixing must lie between 0 and 1, not 1.1"),
-    ("thompson", {"prior_mean": INF}, "prior_mean must be finite, not inf"),
-    ("linucb", MATRICES, r"observations of shape \(d,\) in a Box space or in a Discrete space"),
-    ("mabwiser_ucb1", {"tie_breaking": "random"}, "has no argument 'tie_breaking'"),
-    ("ppo", {"engine": "fast", "policy": "MlpPolicy"}, "engine must be one of"),
-    ("qlearning", {"gama": 0.5}, "^QLearning has no argument 'gama'"),
-    ("qlearning_ucb", {"learning_rate": 0.5}, "has no argument 'learning_rate'"),
-    ("lin_thompson", {"ignore_context": 0.5}, "has no argument 'ignore_context'"),
-    ("mabwiser_ucb1", {"mask_actions": 0.5}, "has no argument 'mask_actions'"),
-]
+    *read_yaml(Path(__file__).with_name("wrong_arguments.yml")),
+    ("ucb", {"env": Spaces(spaces.Box(-1, 1, (4,)))}, "observations in a Discrete space"),
+    ("linucb", {"env": Spaces(spaces.Box(-1, 1, (2, 2)))},
+     r"observations of shape \(d,\) in a Box space or in a Discrete space"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "arguments", "line"), REFUSED)

@@ -141,8 +141,7 @@ def test_termination_leaves_the_reward_alone_and_truncation_does_not(name):
         assert set(fed.agent.policy.q_tables[:, 0, 1].tolist()) - {1} == targets
         skipping = Fed(name, table, learning_rate=1.0, skip_terminal_update=True)
         skipping.step(0, 1, 2, 1, end)
-        changed = int(skipping.agent.policy.visit_counts.sum())
-        assert changed == (end != "terminated")
+        assert int(skipping.agent.policy.visit_counts.sum()) == (end != "terminated")
 
 
 def test_one_update_by_hand():

@@ -40,8 +40,7 @@ def episodes(out):
 def test_so_many_steps_or_so_many_episodes_in_silence_if_asked(type_enjoy, tmp_path):
     lengths = episodes(type_enjoy.done(*PLAY))
     assert len(lengths) == 10
-    both = episodes(type_enjoy.done(*PLAY, "-n", "500", "--n-episodes", "3"))
-    assert both == lengths[:3]
+    assert episodes(type_enjoy.done(*PLAY, "-n", "500", "--n-episodes", "3")) == lengths[:3]
     assert sum(episodes(type_enjoy.done(*PLAY, "-n", "60"))) <= 60
     assert type_enjoy.done(*PLAY, "--verbose", "0") == ""
     words = ["--n-envs", "3", "--n-episodes", "8", "--reward-log", "returns"]

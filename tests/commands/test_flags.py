@@ -117,8 +117,7 @@ ENGINES = [
 
 def test_an_engine_is_a_setting_where_there_is_a_choice(tmp_path):
     for words, engine in ENGINES:
-        found = trained("--algo", *words.split()).algorithm.get("engine")
-        assert found == engine, words
+        assert trained("--algo", *words.split()).algorithm.get("engine") == engine, words
     words = ["--algos", "qlearning", "ppo", "optimal", "--engine", "auto", "-n", "9"]
     planned = plan(compared(*LAKE, *words), tmp_path)
     engines = {run.agent: run.spec.algorithm.get("engine") for run in planned}

@@ -3,6 +3,7 @@
 import json
 import sys
 import zipfile
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +16,7 @@ from rl_yardstick.experiments.pool import process_pool
 from rl_yardstick.pipeline.components import import_modules
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.models import load, load_agent, model_of_run
+from rl_yardstick.pipeline.settings import read_yaml
 from tests.pipeline.short_runs import LAKE, cut_off, resumed, run_of, spec_of
 
 MODULE = """
@@ -175,25 +177,7 @@ def test_it_is_judged_as_it_acts_unless_it_says_how_to_act_without_exploring():
     assert (found, done.final.is_exact) == (is_exact, False)
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("mien:Table", "no module named mien"),
-        ("mine:Tabel", "mine:Tabel: there is no class 'Tabel': did you mean 'Table'?"),
-        ("mine:number", "mine.number is no class, but of type int"),
-        ("mine:Asked", "mine.Asked lacks act and learn; it has get_action"),
-        ("./mine.py:Short", "has learn(obs, action, reward), which does not take (obs, action,"),
-        ("mine:Needs", "Needs needs alpha: give -params alpha:VALUE; filled in are observation"),
-        ("mine:Open", "Open cannot pickle '_io.TextIOWrapper' object: leave it out"),
-        ("mine:Kept", "Kept cannot be written as JSON: builtins.function: leave"),
-        ("broken:Agent", "broken.py:1: SyntaxError: "),
-        ("broken2:Agent", "broken2.py:1: ZeroDivisionError: division by zero"),
-        ("mine:Outside", "at step 0: Outside.act returned 7, not in Discrete(4)"),
-        ("mine:Half", "Half.act returned 0.0, not in Discrete(4): return int(...)"),
-        ("mine:Void", "at step 1: Void.values(obs) is NaN for an observation"),
-        ("mine.Table", "unknown agent 'mine.Table'"),
-    ],
-)
+@pytest.mark.parametrize(("name", "words"), read_yaml(Path(__file__).with_name("no_agents.yml")))
 def test_what_is_no_agent_is_refused(typed, own_folder, name, words):
     code, _, err = typed("train.py", "--algo", name, "--env", LAKE, "-n", "20")
     assert code == 2
@@ -235,11 +219,7 @@ def test_commands_take_it(typed, own_folder, in_this_process):
     assert typed("train.py", *words, *algo, *zipped)[::2] == (0, "")
     words += ["--algos", "random", "mine:Table", "mine:Mine", "--seeds", "2", "--no-report"]
     assert "mine.Table                 undecided" in typed.done("compare.py", *words)
-
-
-def test_audit_takes_it(typed, own_folder):
-    words = ("--algo", "mine:Table", "--kind", "q_learning", "--seeds", "1")
-    out = typed.done("yardstick", "audit", *words)
+    out = typed.done("yardstick", "audit", *algo, "--kind", "q_learning", "--seeds", "1")
     assert out.endswith("0.80 value where cut off\nright\n")
 
 

@@ -106,8 +106,7 @@ def test_statistics_in_a_hand_written_agents_folder(typed, own_folder, payload):
 
 
 def test_a_replay_buffer_beside_the_agent(typed, own_folder, payload):
-    agent = load_algorithm("dqn")("MlpPolicy", ENV, buffer_size=10)
-    agent.save(own_folder / "dqn.zip")
+    load_algorithm("dqn")("MlpPolicy", ENV, buffer_size=10).save(own_folder / "dqn.zip")
     (own_folder / "replay_buffer.pkl").write_bytes(payload)
     words = ["--algo", "dqn", "--env", ENV, "-n", "8", "-i", "dqn.zip"]
     assert "replay_buffer.pkl" in typed.refused("train.py", *words)

@@ -3,6 +3,7 @@
 import json
 import re
 import signal
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -12,6 +13,7 @@ from rl_yardstick.diagnosis import environment_checks
 from rl_yardstick.diagnosis.environment_checks import examine
 from rl_yardstick.envs import ENVIRONMENTS
 from rl_yardstick.pipeline.environment_trial import KINDS
+from rl_yardstick.pipeline.settings import read_yaml
 from tests.diagnosis.planted_environments import PLANTED, RIGHT
 
 OF_GYMNASIUM = ("FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v4", "CliffWalking-v1", "Blackjack-v1")
@@ -112,20 +114,7 @@ class Plain:
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "line"),
-    [
-        (["odd.py:Lake"], 0, "Lake: nothing found in "),
-        (["odd:Lake", "--env-kwargs", "is_slippery:False"], 0, "Lake: nothing found in "),
-        (["odd.py:Raising"], 1, "breaks crash: RuntimeError: no licence (odd.py:10); see the"),
-        (["odd.py:Leaving"], 1, "breaks crash: SystemExit: 0 (odd.py:14); see the message"),
-        (["odd.py:Agents"], 1, "breaks no-space: observation_space is no gymnasium space"),
-        (["odd.py:Endless"], 1, "breaks hangs: the checks took too long here (odd.py:26); end"),
-        (["odd.py:Sized"], 2, "Sized: Sized.__init__() missing 1 required positional argument: 's"),
-        (["odd.py:Sized", "--env-kwargs", "sise:3"], 2, "Sized: unknown argument 'sise': did you"),
-        (["odd.py:Plain"], 2, "Plain: The environment must inherit from the gymnasium.Env class"),
-        (["odd.py:None"], 2, "odd.py:None: there is no class 'None'"),
-        (["elsewhere:Lake"], 2, "elsewhere:Lake: no module named elsewhere"),
-    ],
+    ("words", "code", "line"), read_yaml(Path(__file__).with_name("check_env.yml"))
 )
 def test_what_is_typed(typed, own_folder, monkeypatch, words, code, line):
     (own_folder / "odd.py").write_text(ODD)

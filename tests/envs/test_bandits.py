@@ -13,6 +13,7 @@ from rl_yardstick.envs import bandits
 from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs.wrappers import ScaleReward
 from rl_yardstick.mdp import baseline_return, finite_horizon_optimum, policy_return
+from rl_yardstick.pipeline.settings import read_yaml
 
 LOG = Path(__file__).parent / "uniform_log.csv"
 
@@ -143,18 +144,7 @@ def test_logs_of_any_form(name, tmp_path):
 
 
 MISTAKES = [
-    ("", "cannot read .*: No columns to parse from file"),
-    ("arm,reward\n", "holds no pulls: a header and a row for each are needed"),
-    ("arm;reward\n0;1\n", "has no column 'arm', but arm;reward"),
-    ("arm,reward,arm\n0,1,2\n", "has more than one column 'arm', but arm, reward, arm"),
-    ("arm,reward\n0,1\n0\n", ", row 2: reward is '', it must be a finite number"),
-    ("arm,reward\n0,1,5\n0,1,5\n", "its rows have more values than its header"),
-    ("arm,reward\n0,1\n0,1,5\n", "cannot read .*: .*Expected 2 fields in line 3, saw 3"),
-    ("arm,reward\n0,1\n0,yes\n", ", row 2: reward is 'yes', it must be a finite number"),
-    ("arm,reward\n0,1\n0.5,1\n", ", row 2: arm is '0.5', it must be a whole number from 0 to 9"),
-    ("arm,reward,propensity\n0,1,0\n", ", row 1: propensity is '0', it must be a probability"),
-    ("arm,reward,x\n0,1,3\n0,1,core\n", ", row 2: x is 'core', it must .*: text can only be all"),
-    ("arm,reward,x,y\n0,1,3,core\n", ", row 1: y is 'core', it must be a finite number"),
+    *read_yaml(LOG.with_name("wrong.yml"))["logs"],
     ("arm,reward,x\n0,1,\xff\n".encode("latin1"), r"cannot read .*: 'utf-8' codec can't decode"),
 ]
 

@@ -71,12 +71,8 @@ class Nameless(gym.Env):
         self.reset, self.step = self.inner.reset, self.inner.step
 
 
-def in_bins(env, bins, **kwargs):
-    return DiscretizeObservation(env, bins, **kwargs)
-
-
 def test_a_slide_by_hand():
-    model = cut_world(in_bins(ScaleReward(Slide(), 2.0), 10))
+    model = cut_world(DiscretizeObservation(ScaleReward(Slide(), 2.0), 10))
     assert (model.n_states, model.initial[0]) == (10, 1)
     for place in range(10):
         last = place == 9
@@ -134,7 +130,7 @@ def planned_by_loops(n, discount):
 
 
 def test_mountain_car_beside_a_loop():
-    model = cut_world(in_bins(gym.make("MountainCar-v0"), 6))
+    model = cut_world(DiscretizeObservation(gym.make("MountainCar-v0"), 6))
     chances, values = planned_by_loops(6, 0.9)
     for (state, action), expected in chances.items():
         found = {}
@@ -161,7 +157,7 @@ PLANS = [  # environment, into how many its actions are cut, its bins, and the l
 def test_what_plans_return_in_the_real_world(env_id, n_actions, cut, least):
     env = gym.make(env_id)
     env = env if n_actions is None else gym.wrappers.DiscretizeAction(env, n_actions)
-    env = Monitor(in_bins(env, **cut))
+    env = Monitor(DiscretizeObservation(env, **cut))
     env.reset(seed=7)
     before = env.unwrapped.np_random.bit_generator.state, list(env.unwrapped.state)
     model = cut_world(env)
@@ -195,6 +191,6 @@ def test_what_cannot_be_cut(name):
     make, bins, reason = REFUSED[name]
     found_models.limit("none")  # it would find the exact model of the slide
     with pytest.raises(ValueError, match=f"plans on bins where .* classic control: .*{reason}"):
-        load_algorithm("value_iteration")(env=in_bins(make(), bins)).learn(1)
+        load_algorithm("value_iteration")(env=DiscretizeObservation(make(), bins)).learn(1)
     found_models.limit("auto")
     assert cut_world(make()) is None

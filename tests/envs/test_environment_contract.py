@@ -21,8 +21,10 @@ from rl_yardstick.envs import known_models as known
 from rl_yardstick.envs import wrappers as wrap
 from rl_yardstick.envs.mine_maze import MineMazeEnv
 from rl_yardstick.mdp import TransitionModel
+from rl_yardstick.pipeline.settings import read_yaml
 
 LOG = {"log": str(Path(__file__).parent / "uniform_log.csv")}
+WRONG = read_yaml(Path(__file__).with_name("wrong.yml"))
 # An environment that is registered later is held to its contract as it is.
 OURS = "rl_yardstick.envs."
 SPECS = [spec for spec in gym.registry.values() if str(spec.entry_point).startswith(OURS)]
@@ -121,32 +123,7 @@ def test_p_is_the_model_as_dictionaries(env_id, kwargs):
     assert [type(value) for value in env.P[0][0][0]] == [float, int, float, bool]
 
 
-ONE = {"segment_probabilities": [1], "click_rates": [[0.5]]}
-REFUSED = [
-    ("Warehouse", {"slip": -0.1}, "slip must be a finite number from 0 to 1, not -0.1"),
-    ("Warehouse", {"slip": float("nan")}, "slip must be a finite number from 0 to 1, not nan"),
-    ("Warehouse", {"slip": True}, "slip must be a finite number from 0 to 1, not True"),
-    ("Warehouse", {"shelf_reward": "a"}, "shelf_reward must be a finite number, not 'a'"),
-    ("Warehouse", {"observation": "positon"}, "'positon': did you mean 'position'? It must be one"),
-    ("MineMaze", {"random_start": 1}, "random_start must be true or false, not 1"),
-    ("RandomWarehouse", {"size": 1}, "size must be a whole number from 2 to 4096, not 1"),
-    ("DynaMaze", {"changed": True}, "changed: the maze 'dyna' never changes"),
-    ("DynaMaze", {"maze": "blocking", "change_after_steps": 5}, "change_after_steps needs changed"),
-    ("BernoulliBandit", {"probabilities": [0.5]}, "must hold 2 numbers or more, not 1"),
-    ("BernoulliBandit", {"probabilities": 0.5}, "must be a list of numbers, not 0.5"),
-    ("BernoulliBandit", {"probabilities": [0.5, 1.5]}, "[1] must be a finite number from"),
-    ("GaussianBandit", {"means": [1, 2], "n_arms": 3}, "n_arms is 3, but 2 are given: leave it"),
-    ("GaussianBandit", {"means": [1, 2], "mean_loc": 4}, "mean_loc is for means that are drawn"),
-    ("LinearBandit", {"arm_parameters": []}, "arm_parameters must be a list of rows of numbers"),
-    ("LinearBandit", {"arm_parameters": [[1, 2]]}, "arm_parameters must have two rows or more"),
-    ("LinearBandit", {"arm_parameters": [[1, 2], [1]]}, "[1] has length 1, arm_parameters[0] has"),
-    ("SegmentBandit", {"segment_probabilities": [0.3, 0.6]}, "must sum to 1, not to 0.9"),
-    ("SegmentBandit", {"segment_probabilities": [0.3, 0.3, 0.4]}, "a row for each segment: 3"),
-    ("SegmentBandit", ONE, "click_rates must have a column for each treatment, two or more"),
-]
-
-
-@pytest.mark.parametrize(("name", "wrong", "line"), REFUSED, ids=str)
+@pytest.mark.parametrize(("name", "wrong", "line"), WRONG["arguments"], ids=str)
 def test_arguments_out_of_range_are_refused(name, wrong, line):
     with pytest.raises(ValueError, match=re.escape(line)) as refused:
         gym.make(f"{name}-v0", **wrong)

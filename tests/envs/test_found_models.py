@@ -1,5 +1,7 @@
 """Models found in the code of environments: in wrappers, under limits, and kept on disk."""
 
+from unittest.mock import Mock
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -103,36 +105,25 @@ def test_an_action_that_raises_is_masked_and_never_better():
     assert stays.expected_return <= by_hand() + 1e-9
 
 
-def counted(monkeypatch):
-    searches = []
-
-    def model_of(env, **limits):
-        searches.append(env)
-        return original(env, **limits)
-
-    original = found_models.model_of
-    monkeypatch.setattr(found_models, "model_of", model_of)
-    return searches
-
-
 def forget():
     found_models._of_name.clear()
 
 
 def test_a_search_is_kept_for_the_same_code_and_arguments(monkeypatch, tmp_path):
-    searches = counted(monkeypatch)
+    search = Mock(wraps=found_models.model_of)
+    monkeypatch.setattr(found_models, "model_of", search)
     first = ys.optimum("Paces-v0")
     forget()
     assert ys.optimum("Paces-v0")["optimum"] == first["optimum"]
-    assert len(searches) == 1
+    assert search.call_count == 1
     forget()
     assert ys.optimum("Paces-v0", slip=0.5)["optimum"] == pytest.approx(by_hand(slip=0.5))
-    assert len(searches) == 2
+    assert search.call_count == 2
     for file in (tmp_path / "yardstick" / "models").iterdir():
         file.write_bytes(b"broken")
     forget()
     assert ys.optimum("Paces-v0")["optimum"] == first["optimum"]
-    assert len(searches) == 3
+    assert search.call_count == 3
 
 
 def test_other_code_of_the_same_name_is_searched_anew(monkeypatch, tmp_path):

@@ -90,7 +90,6 @@ def ladder(reward):
     return table
 
 
-LADDER = ladder(2.0), ladder(1.0), np.eye(16)[0]
 SAYS = r"^the environment's P is not what step does: state 3, action \d: the model has no step to"
 FALSE = {
     "reward": (lambda: Corridor(outcomes(goal_reward=10.0), outcomes()),
@@ -102,7 +101,7 @@ FALSE = {
     "frequency of a start": (
         lambda: Corridor(start=(0.9, 0.1, 0, 0, 0)),
         r"reset: the start in state \d has a probability of 0\.[19], it came"),
-    "far away": (lambda: Corridor(*LADDER),
+    "far away": (lambda: Corridor(ladder(2.0), ladder(1.0), np.eye(16)[0]),
         r"state 15, action 1: the model has no step to the end with the reward 1, "),
     "truncates": (lambda: odd(step=truncates),
         "step, which raised ValueError: it gave truncated: leave time limits to max_episode_steps"),
@@ -164,8 +163,7 @@ def test_the_caller_notices_nothing():
 
 
 def test_an_environment_that_cannot_be_copied_is_made_anew():
-    env = gym.make("Locked-v0", true=outcomes(wind=0.5))
-    assert model_check(env).refusal is None
+    assert model_check(gym.make("Locked-v0", true=outcomes(wind=0.5))).refusal is None
     assert "which raised TypeError: cannot pickle" in model_check(Locked()).refusal
 
 

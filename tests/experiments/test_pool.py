@@ -31,8 +31,7 @@ def walk(own_folder):
         agents = (AgentSpec("sarsa", "sarsa", {"engine": "interpreted"}, tuned=False),)
         place = EnvironmentSpec("Walk-v0", "Walk-v0", {"n_timesteps": n_timesteps})
         study = StudySpec("s", "S", agents, (place,), 10, gym_packages=("walks",), eval_freq=300)
-        runs = plan(study, own_folder / "s")
-        return study, [run for run in runs if run.seed in seeds]
+        return study, [run for run in plan(study, own_folder / "s") if run.seed in seeds]
 
     return planned
 

@@ -202,8 +202,7 @@ def test_ranks_estimates_and_pairs(tmp_path):
     best = environment.agents[0]
     figures = [best.metric.mean, best.score, best.success_rate, best.seconds]
     assert [figure.point for figure in figures] == pytest.approx([91, 0.91, 1, 2.5])
-    others = best.stochastic.point, best.discounted.point
-    assert others == pytest.approx((86, 45.5))
+    assert (best.stochastic.point, best.discounted.point) == pytest.approx((86, 45.5))
     assert (best.acts_by, best.discount, best.discounted_optimum) == ("epsilon 0.1", 0.9, 50)
     (pair,) = environment.pairs
     assert (pair.first, pair.second, pair.text) == ("sarsa", "qlearning", "better")
@@ -233,8 +232,7 @@ def test_what_is_within_reach_goes_by_the_lower_end_of_a_bracket(tmp_path):
         final |= {"optimum": 520.0, "optimum_at_least": 420.0, "baseline": 20.0}
         final |= {"gap": 520 - value, "score": (value - 20) / 500}
         write_run(run, [(50, value / 2), (100, value)], final=final)
-    results = read_results(study, planned, tmp_path)
-    (environment,) = analyse(results).environments
+    (environment,) = analyse(read_results(study, planned, tmp_path)).environments
     assert (environment.optimum, environment.optimum_at_least) == (520, 420)
     assert environment.threshold == 475, "the environment's own"
     assert environment.agents[1].score.point == pytest.approx(380 / 500)

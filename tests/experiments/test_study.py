@@ -11,13 +11,7 @@ from hypothesis import strategies as st
 
 from rl_yardstick.experiments import plan as plans
 from rl_yardstick.experiments import study as studies
-from rl_yardstick.experiments.study import (
-    AgentSpec,
-    EnvironmentSpec,
-    StudySpec,
-    find_study,
-    read_study,
-)
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, read_study
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.run import FAILED, FINISHED
 from rl_yardstick.pipeline.settings import read_yaml
@@ -125,14 +119,14 @@ def test_a_shipped_study_is_found_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shipped = SHIPPED / "mine-maze.yml"
     for name in ("mine-maze", "studies/mine-maze.yml"):
-        assert find_study(name) == shipped
+        assert studies.find_study(name) == shipped
     assert read_study(shipped).name == "mine-maze"
     # A file of the user's own comes first, and elsewhere ours are not looked for.
     Path("mine-maze.yml").touch()
-    assert find_study("mine-maze.yml") == Path("mine-maze.yml")
-    assert find_study("mine-maze") == shipped
+    assert studies.find_study("mine-maze.yml") == Path("mine-maze.yml")
+    assert studies.find_study("mine-maze") == shipped
     with pytest.raises(UserError, match=r"mine-mase: no such file.* did you mean 'mine-maze'"):
-        find_study("mine-mase")
+        studies.find_study("mine-mase")
 
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.rglob("*.yml")), ids=lambda path: path.stem)
@@ -161,7 +155,7 @@ DRY = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_episodes": 9})
 
 def study_of(*agents, environments=(LAKE,), **fields):
     agents = tuple(AgentSpec(agent, agent) if isinstance(agent, str) else agent for agent in agents)
-    return StudySpec("lakes", "Lakes", agents, tuple(environments), **fields)
+    return studies.StudySpec("lakes", "Lakes", agents, tuple(environments), **fields)
 
 
 def only(study, root=NOWHERE):

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import partial
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,15 +10,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rl_yardstick import mdp
-from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.mdp.planning import Plan
+from tests.mdp.test_evaluation import model_of
 from tests.mdp.test_random_models import deterministic, models
 
 PLANNERS = pytest.mark.parametrize("plan", [mdp.value_iteration, mdp.policy_iteration])
-
-
-def model_of(env_id, **kwargs):
-    return transition_model(gym.make(f"envs:{env_id}", **kwargs))
 
 
 OPTIMA = [

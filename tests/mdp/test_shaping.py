@@ -96,8 +96,7 @@ def test_best_and_worst_are_those_of_all_optimal_policies(data, model, discount)
 
     returns = np.array([worth(model, p, None, discount) for p in policies])
     assert_effect(found, returns, are_optimal(model.reward), are_optimal(shaped.reward))
-    worst = worth(model, found.worst_policy, 4)
-    assert worst == pytest.approx(found.judged[1], abs=1e-9)
+    assert worth(model, found.worst_policy, 4) == pytest.approx(found.judged[1], abs=1e-9)
 
 
 @settings(max_examples=30)

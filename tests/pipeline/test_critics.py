@@ -140,8 +140,7 @@ def test_the_exact_gradient_is_that_of_finite_differences():
     agent.policy.mlp_extractor.forward_actor = lambda features: actor(features.double())
     policy = policy_matrix(agent, world.observations, deterministic=False)
     visits = state_visitation(world.model, policy, 400)
-    advantages = world.values(policy, 1.0).advantages
-    weights = (visits[:, None] * policy * advantages)[None]
+    weights = (visits[:, None] * policy * world.values(policy, 1.0).advantages)[None]
     (found,) = critics._gradients(agent.policy, world, np.arange(2), weights)
 
     def value():

@@ -13,16 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn, optim
 
 from rl_yardstick.envs.wrappers import OneHotObservation, ScaleReward, TerminationReward
-from rl_yardstick.pipeline import components
-from rl_yardstick.pipeline.environments import (
-    EVALUATION_TIME_LIMIT,
-    kwargs_of,
-    make_envs,
-    make_single_env,
-    make_training_env,
-    training_changes,
-    with_files_read,
-)
+from rl_yardstick.pipeline import components, environments
+from rl_yardstick.pipeline.environments import make_envs, make_single_env, make_training_env
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.spec import Component
 from rl_yardstick.pipeline.training import make_agent
@@ -57,21 +49,19 @@ def test_which_arguments_reach_training_and_which_evaluation(tmp_path):
     spec = world("Warehouse-v0", {**ENTRY, "n_envs": 2})
     shared = {"step_reward": -2}
     own = {"goal_reward": 60, "random_start": True, "max_episode_steps": 30}
-    assert kwargs_of(spec, training=True) == {**shared, **own}
+    assert environments.kwargs_of(spec, training=True) == {**shared, **own}
     own = {"goal_reward": 50, "slip": 0.1, "max_episode_steps": 40}
-    assert kwargs_of(spec) == {**shared, **own}
+    assert environments.kwargs_of(spec) == {**shared, **own}
     training, evaluation = make_training_env(spec, tmp_path), make_envs(spec, 3)
     assert (training.num_envs, evaluation.num_envs) == (2, 3)
     for env, goal_reward, limit in ((training, 60, 30), (evaluation, 50, 40)):
-        single = make_single_env(spec, training=env is training)
-        for each in (*env.envs, single):
+        for each in (*env.envs, make_single_env(spec, training=env is training)):
             kwargs = each.unwrapped.spec.kwargs
             assert (kwargs["step_reward"], kwargs["goal_reward"]) == (-2, goal_reward)
             assert time_limit(each) == limit
             assert ("slip" in kwargs) == (env is evaluation)
         # Only training begins anywhere.
-        starts = {int(env.reset()[0]) for _ in range(20)}
-        assert (len(starts) > 1) == (env is training)
+        assert (len({int(env.reset()[0]) for _ in range(20)}) > 1) == (env is training)
     training.close()
     # Only training is recorded.
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0.monitor.csv", "1.monitor.csv"]
@@ -80,16 +70,16 @@ def test_which_arguments_reach_training_and_which_evaluation(tmp_path):
 
 @pytest.mark.parametrize(("entry", "changes"), TABLES["changes"])
 def test_what_training_changes(entry, changes):
-    assert [*training_changes(world("Warehouse-v0", entry))] == changes
+    assert [*environments.training_changes(world("Warehouse-v0", entry))] == changes
 
 
 def test_evaluation_always_has_a_time_limit():
     """Where one is taken away, training may go on without end."""
     unlimited = {"max_episode_steps": -1}
     for env_id, entry, limit in (
-        ("CliffWalking-v1", {}, EVALUATION_TIME_LIMIT),
+        ("CliffWalking-v1", {}, environments.EVALUATION_TIME_LIMIT),
         (CART, {"train_env_kwargs": unlimited}, 500),
-        (CART, {"env_kwargs": unlimited}, EVALUATION_TIME_LIMIT),
+        (CART, {"env_kwargs": unlimited}, environments.EVALUATION_TIME_LIMIT),
     ):
         spec = world(env_id, entry)
         made = make_single_env(spec, training=True), make_training_env(spec, None).envs[0]
@@ -147,11 +137,11 @@ def test_a_maps_rows_take_the_place_of_its_path_and_a_log_is_found_from_other_fo
         settings = {"gamma": 0.9, key: {"desc": "map.txt", "slip": 0.1}}
         read = {"gamma": 0.9, key: {"desc": ["S..", ".#.", "..G"], "slip": 0.1}}
         for each in (settings, read):
-            assert with_files_read("Warehouse-v0", each) == read
+            assert environments.with_files_read("Warehouse-v0", each) == read
         assert settings[key]["desc"] == "map.txt"
-    assert with_files_read("CartPole-v1", settings) == settings
+    assert environments.with_files_read("CartPole-v1", settings) == settings
     logs = {"env_kwargs": {"log": "pulls.csv"}, "eval_env_kwargs": {"log": "/a.csv"}}
-    found = with_files_read("ReplayBandit-v0", logs)
+    found = environments.with_files_read("ReplayBandit-v0", logs)
     assert found == {**logs, "env_kwargs": {"log": str(tmp_path / "pulls.csv")}}
 
 

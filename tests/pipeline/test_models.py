@@ -15,15 +15,9 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
 
+from rl_yardstick.pipeline import models
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.models import (
-    Wanted,
-    find_model,
-    load,
-    load_agent,
-    model_in,
-    replay_buffer_of,
-)
+from rl_yardstick.pipeline.models import Wanted, find_model, load_agent, model_in
 from rl_yardstick.pipeline.playing import play_episodes, playing_env
 from tests.pipeline.short_runs import CART, run_of, spec_of
 
@@ -171,7 +165,7 @@ def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(tm
         ("rl_model_80_steps.zip", of_80),
         ("best_model.zip", "replay_buffer.pkl"),
     ):
-        assert replay_buffer_of(first.path / model) == first.path / name
+        assert models.replay_buffer_of(first.path / model) == first.path / name
     fields["trained_agent"] = str(model_in(first.path))
     run = train_to(tmp_path / "next", "dqn", SMALL_DQN, 50, **fields)
     before, after = (read(one.path / "replay_buffer.pkl") for one in (first, run))
@@ -309,5 +303,5 @@ def test_a_setting_that_is_code_is_refused_with_a_way_out(tmp_path, key):
     setattr(model, key, value)
     model.save(tmp_path / "model")
     with pytest.raises(UserError) as refused:
-        load(spec_of("ppo", CART), tmp_path / "model.zip", None, device="cpu")
+        models.load(spec_of("ppo", CART), tmp_path / "model.zip", None, device="cpu")
     assert str(refused.value).endswith(end)

@@ -127,8 +127,7 @@ def test_the_result_is_that_of_an_undisturbed_run(
     whole, _ = run_of(spec, "whole")
     whole = Run((tmp_path / "w" / whole.path).absolute())
     monkeypatch.chdir(tmp_path)
-    run = cut_off(spec, monkeypatch)
-    assert_same(whole, resumed(run))
+    assert_same(whole, resumed(cut_off(spec, monkeypatch)))
     if "log_interval" in fields:
         assert events(tmp_path) == events(tmp_path / "w")
 

@@ -14,19 +14,11 @@ from rl_yardstick.agents.compiled import engine
 from rl_yardstick.envs.wrappers import DiscretizeObservation
 from rl_yardstick.pipeline.environments import make_envs, make_training_env
 from rl_yardstick.pipeline.evaluation import sampled
-from rl_yardstick.pipeline.evaluation.sampled import (
-    Evaluation,
-    SampledEvaluator,
-    Yardstick,
-    bracketed_yardstick,
-    evaluate,
-    evaluate_compiled,
-    evaluation_seed,
-)
+from rl_yardstick.pipeline.evaluation.sampled import evaluate, evaluation_seed
+from rl_yardstick.pipeline.evaluation.yardstick import Evaluation, Yardstick
 from rl_yardstick.pipeline.models import load
 from tests.pipeline.short_runs import CART, LAKE, Steady, agent_of, run_of, spec_of
 
-CAR = "MountainCar-v0"
 PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
 
 
@@ -86,7 +78,7 @@ def steady(monkeypatch, returns, length, n_timesteps):
 )
 def test_the_last_evaluation_ends_when_it_is_sure_or_dear(monkeypatch, returns, length, n_episodes):
     spec = steady(monkeypatch, returns, length, 3000)
-    evaluator = SampledEvaluator(spec, make_envs(spec, 1))
+    evaluator = sampled.SampledEvaluator(spec, make_envs(spec, 1))
     found = evaluator.at_the_end(agent_of("random", make_training_env(spec, None)))
     assert len(found.returns) == n_episodes
     assert evaluator.n_steps == n_episodes * length
@@ -127,8 +119,7 @@ POLE = Yardstick(optimum=500.0, baseline=20.0, at_least=480.0)
 
 
 def test_the_upper_end_measures_and_the_lower_stands_beside_it():
-    found = episodes(260.0, 260.0, yardstick=POLE)
-    figures = found.summary()
+    figures = episodes(260.0, 260.0, yardstick=POLE).summary()
     assert (figures["optimum"], figures["optimum_at_least"]) == (500, 480)
     assert (figures["gap"], figures["gap_at_least"]) == (240, 220)
     assert (figures["score"], figures["score_at_most"]) == (0.5, pytest.approx(240 / 460))
@@ -136,7 +127,7 @@ def test_the_upper_end_measures_and_the_lower_stands_beside_it():
     known = episodes(80.0, yardstick=Yardstick(100.0, 60.0)).summary()
     assert known["score"] == 0.5
     assert not {"optimum_at_least", "gap_at_least", "score_at_most"} & known.keys()
-    guessed = bracketed_yardstick(spec_of("random", "Acrobot-v1"))
+    guessed = sampled.bracketed_yardstick(spec_of("random", "Acrobot-v1"))
     assert guessed == Yardstick(-38.0, -498.625, -60.408, is_proven=False)
     assert episodes(-40.0, yardstick=guessed).summary()["optimum_is_proven"] is False
 
@@ -151,7 +142,7 @@ SMALL = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [16]}}
     [
         ("double_qlearning", CART, IN_BINS, {}),
         ("reinforce", CART, None, WIDTHS),
-        ("dqn", CAR, None, SMALL),
+        ("dqn", "MountainCar-v0", None, SMALL),
     ],
 )
 def test_compiled_play_is_the_same_to_the_bit(monkeypatch, algo, env_id, wrapper, settings):
@@ -167,7 +158,8 @@ def test_compiled_play_is_the_same_to_the_bit(monkeypatch, algo, env_id, wrapper
     for i, play in enumerate([(5, 1), (23, None), (2, None), (5, 0)]):
         if i == 2:
             monkeypatch.setattr(engine, "STEPS_AT_ONCE", 7)
-        found, expected = evaluate_compiled(model, copy, *play), evaluate(model, plain, *play)
+        found = sampled.evaluate_compiled(model, copy, *play)
+        expected = evaluate(model, plain, *play)
         assert figures(found) == figures(expected)
         assert (found.returns.dtype, found.lengths.dtype) == (expected.returns.dtype, np.int64)
         assert found.successes is expected.successes is None

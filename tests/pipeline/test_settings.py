@@ -100,17 +100,7 @@ def test_rl_zoo3_entries_load_unchanged(path):
         assert constructor_arguments(spec, load_algorithm(algo), False)
 
 
-@pytest.mark.parametrize(
-    ("env_id", "kwargs", "gamma"),
-    [
-        ("CartPole-v1", None, 0.2),
-        ("Warehouse-v0", None, 0.0),
-        ("ALE/Pong-v5", None, 0.1),
-        # An environment has its entry by whichever of its names.
-        ("CliffWalking-v1", {"is_slippery": True}, 0.4),
-        ("FrozenLake-v1", {"map_name": "8x8"}, 0.5),  # FrozenLake8x8-v1 has another time limit
-    ],
-)
+@pytest.mark.parametrize(("env_id", "kwargs", "gamma"), TABLES["entries"])
 def test_which_entry_is_taken(tmp_path, env_id, kwargs, gamma):
     names = ["default", "atari", "CartPole-v1", "CliffWalking-v1", "CliffWalkingSlippery-v1"]
     entries = [*names, "FrozenLake-v1", "FrozenLake8x8-v1"]
@@ -202,25 +192,9 @@ def test_what_is_asked_for_wins_over_an_entrys_variant_for_training():
 
 CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": "auto"}}
 SCALE = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": "auto"}}
-SHORT = {"max_episode_steps": 200}
-# Nobody knows the model of what depends on earlier actions.
-CHANGES = {"env_kwargs": {"maze": "blocking", "changed": True, "change_after_steps": 9}}
-POOR = {"shelf_reward": -1, "step_reward": -0.01, "goal_reward": 1}
 
 
-@pytest.mark.parametrize(
-    ("env_id", "raw", "value"),
-    [
-        ("FrozenLake-v1", {"gamma": "auto"}, 0.995),
-        # Ten times the shortest way of 18 moves.
-        ("RandomWarehouse-v0", {"gamma": "auto"}, 0.9972222),
-        ("CliffWalking-v1", {"gamma": "auto", "eval_env_kwargs": SHORT}, 0.9975),
-        ("RandomWarehouse-v0", {"n_timesteps": "auto_1000", "env_kwargs": {"size": 30}}, 3_600_000),
-        ("Warehouse-v0", {"learning_rate": "auto", "n_timesteps": "auto"}, "exp_0.3_0.004"),
-        ("FrozenLake-v1", {"initial_q": "auto", "env_kwargs": {"reward_schedule": [7, -3, 0]}}, 7),
-        ("Warehouse-v0", {"value_bound": "auto", "env_kwargs": POOR}, 1.0),
-    ],
-)
+@pytest.mark.parametrize(("env_id", "raw", "value"), TABLES["auto"])
 def test_the_word_becomes_a_number_of_the_environment(env_id, raw, value):
     algo = "qlearning" if "value_bound" not in raw else "r_max"
     spec, key = spec_of(algo, env_id, **raw), next(iter(raw))
@@ -237,14 +211,7 @@ def test_the_dearest_step_of_training_costs_a_tenth_of_the_goal():
     assert set(spec.origins) == {"train_env_wrapper"}
 
 
-@pytest.mark.parametrize(
-    ("env_id", "raw", "said"),
-    [
-        ("DynaMaze-v0", {"initial_q": "auto", **CHANGES}, "initial_q: auto needs a known model"),
-        ("DynaMaze-v0", {"train_env_wrapper": [SCALE], **CHANGES}, "scale: auto needs an env"),
-        ("CartPole-v1", {"n_timesteps": "auto"}, "qlearning does not fit CartPole-v1"),
-    ],
-)
+@pytest.mark.parametrize(("env_id", "raw", "said"), TABLES["not_worked_out"])
 def test_what_cannot_be_worked_out_is_refused(env_id, raw, said):
     with pytest.raises(UserError, match=said):
         spec_of("qlearning", env_id, **raw)

@@ -149,8 +149,7 @@ def test_the_picture_of_costs_has_the_scales_of_both_maps(monkeypatch):
 def test_an_action_among_several_best_ones_does_not_differ():
     square = {"desc": ["..G", "...", "S.."], "max_episode_steps": 20}
     for first in (UP, RIGHT):
-        actions = [RIGHT, RIGHT, 0, RIGHT, RIGHT, UP, first, RIGHT, UP]
-        found = map_of(actions, **square)
+        found = map_of([RIGHT, RIGHT, 0, RIGHT, RIGHT, UP, first, RIGHT, UP], **square)
         assert not found.differs.any()
         assert found.values[6] == found.optimal_values[6] == 97
     assert found.optimal_actions[6].tolist() == [True, False, False, True]

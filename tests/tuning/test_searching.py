@@ -14,21 +14,12 @@ from rl_yardstick.experiments.results import RunResults
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.settings import read_entry, read_yaml, seeds_tuned_on
 from rl_yardstick.tuning import retesting, searching
-from rl_yardstick.tuning.searching import (
-    FAILURE,
-    RUNS,
-    SETTINGS,
-    RunOutcome,
-    is_hopeless,
-    open_storage,
-    outcome_of,
-    outcomes_of,
-)
+from rl_yardstick.tuning.searching import RUNS, SETTINGS, RunOutcome, outcomes_of
 from rl_yardstick.verdicts import Estimate, steps_to_threshold
 from tests.experiments.test_growing import results_of
 
-REAL_OUTCOME_OF, REAL_STORAGE = outcome_of, open_storage
-HOPELESS = read_yaml(Path(__file__).with_name("hopeless.yml"))
+REAL_OUTCOME_OF, REAL_STORAGE = searching.outcome_of, searching.open_storage
+TABLES = read_yaml(Path(__file__).with_name("searches.yml"))
 
 
 def states(search):
@@ -106,7 +97,7 @@ def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy):
     for trial in search.trials:
         fails = trial.user_attrs[SETTINGS]["gamma"] > 0.9
         assert trial.state.name == ("PRUNED" if fails else "COMPLETE")
-        assert (FAILURE in trial.user_attrs) == fails
+        assert (searching.FAILURE in trial.user_attrs) == fails
     # Where nothing but failures comes of it, it ends and says why.
     with pytest.raises(UserError, match=r"all of the first 5 trials failed; seed \d: it broke"):
         toy.search(toy.opened(name="failing"), failing=lambda run: True)
@@ -152,36 +143,13 @@ def test_the_storage_keeps_the_search(toy, monkeypatch):
         toy.opened(tuning, "a {b} %20 c?d")
 
 
-VALUES = [
-    ("mean", "score", 0.56),
-    ("mean", "regret", 0.56),
-    ("iqm", "score", (0.1 + 0.8 + 0.9) / 3),
-    ("lower", "score", 0.1),
-    ("lower", "regret", 0.9),
-]
-
-
-@pytest.mark.parametrize(("objective", "figure", "value"), VALUES)
+@pytest.mark.parametrize(("objective", "figure", "value"), TABLES["objectives"])
 def test_values_of_a_setting_by_hand(toy, objective, figure, value):
     tuning = toy.tuning(objective=objective, figure=figure)
     assert tuning.value([0.0, 1.0, 0.9, 0.8, 0.1]) == pytest.approx(value)
 
 
-# The figure, what the run came to, the figure of it, and steps where it had the optimum.
-FIGURES_OF_RUNS = [
-    ("score", {"score": 0.7, "final": 5.0}, 0.7, None),
-    ("score", {"score": None, "final": 5.0}, 5.0, None),
-    ("final", {"score": 0.7, "final": 5.0}, 5.0, None),
-    ("regret", {"regret": 12.0}, 12.0, None),
-    ("steps", {}, 20.0, None),
-    ("steps", {"threshold": 0.9}, 60.0, None),  # never: two whole runs
-    # Only an optimal score has steps.
-    ("score", {"score": 1.0}, 1.0, 20.0),
-    ("score", {"score": 1 - 1e-8, "threshold": 0.9}, 1 - 1e-8, 60.0),
-]
-
-
-@pytest.mark.parametrize(("figure", "row", "value", "steps"), FIGURES_OF_RUNS)
+@pytest.mark.parametrize(("figure", "row", "value", "steps"), TABLES["figures"])
 def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value, steps):
     row = {"seconds": 2.0, "n_timesteps": 30, "threshold": 0.5, **row}
     row["steps_to_threshold"] = steps_to_threshold([10, 20, 30], [0.0, 0.6, 0.4], row["threshold"])
@@ -190,24 +158,17 @@ def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value, steps):
     assert (found.figure, found.seconds, found.steps) == (value, 2.0, steps)
 
 
-@pytest.mark.parametrize(("scores", "others", "options", "hopeless"), HOPELESS)
+@pytest.mark.parametrize(("scores", "others", "options", "hopeless"), TABLES["hopeless"])
 def test_what_is_hopeless(scores, others, options, hopeless):
     if "value" in options:
         options = {"value": statistics.median}
-    found = is_hopeless(dict(enumerate(scores)), [dict(enumerate(o)) for o in others], **options)
+    found = searching.is_hopeless(
+        dict(enumerate(scores)), [dict(enumerate(o)) for o in others], **options
+    )
     assert found is hopeless
 
 
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"until_decided": True, "retest": 0}, "leave out --retest 0"),
-        ({"until_decided": True, "objective": "iqm"}, "decides means of scores, returns"),
-        ({"first_retest_seed": 2}, "seed 2 is one of the search and of the re-test"),
-        # It may grow into the seeds of the search.
-        ({"until_decided": True, "first_seed": 1079}, "seed 1079 is one of the search and of"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "complaint"), TABLES["no_retests"])
 def test_what_a_re_test_cannot_be(toy, changes, complaint):
     first = changes.pop("first_seed", 0)
     tuning = toy.tuning(**changes)
@@ -246,16 +207,7 @@ def complete_trial(number, entry, figures):
     return trial
 
 
-@pytest.mark.parametrize(
-    ("figures", "is_below"),
-    [
-        ((0.1, 0.2, 0.3), True),  # the means differ by 0.6, the standard error is 0.082
-        ((0.6, 0.7, 0.8), False),  # by 0.1
-        ((0.8, 0.8, 0.8), False),  # equal means
-        ((1.1, 1.2, 1.3), False),
-        ((0.1,), False),
-    ],
-)
+@pytest.mark.parametrize(("figures", "is_below"), TABLES["below"])
 def test_settings_clearly_below_the_shipped_ones_are_not_run_again(toy, figures, is_below):
     def chosen(figure, *others):
         found = [complete_trial(n, {}, each) for n, each in enumerate(others) if each]

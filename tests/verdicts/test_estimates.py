@@ -107,8 +107,7 @@ def test_the_shared_grid_is_where_all_curves_are():
 
 
 def test_a_curve_on_a_grid_holds_its_latest_value():
-    grid = [0, 10, 14.9, 20, 99]
-    found = verdicts.on_grid([10, 20], [1, 2], grid).tolist()
+    found = verdicts.on_grid([10, 20], [1, 2], [0, 10, 14.9, 20, 99]).tolist()
     assert found == pytest.approx([NAN, 1, 1, 2, 2], nan_ok=True)
     # Two evaluations at one step: the later one.
     assert verdicts.on_grid([10, 10, 20], [1, 5, 2], [10]).tolist() == [5]
