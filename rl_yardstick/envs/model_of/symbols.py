@@ -37,8 +37,8 @@ class Limit(Stop):
 
 
 def seconds_since(begun: tuple[float, float]) -> float:
-    """Of processor time, but at least a fifth of those by the clock: an environment may wait."""
-    return max(process_time() - begun[0], (perf_counter() - begun[1]) / 5)
+    """Of processor time, but at least half of those by the clock: an environment may wait."""
+    return max(process_time() - begun[0], (perf_counter() - begun[1]) / 2)
 
 
 def where() -> str:
