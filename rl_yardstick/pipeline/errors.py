@@ -20,9 +20,9 @@ OTHER_NAMES: dict[str, tuple[str, ...]] = {
 }
 
 # Where code is that is not the user's own: libraries, this project, Python's imports.
-_PACKAGE = f"{Path(__file__).parents[1]}/"
 _LIBRARIES = (sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
-_NOT_OWN = (*_LIBRARIES, _PACKAGE, "<frozen")
+PACKAGE = f"{Path(__file__).parents[1]}/"
+_NOT_OWN = (*_LIBRARIES, PACKAGE, "<frozen")
 
 _brief = reprlib.Repr()
 _brief.maxstring = _brief.maxother = 60
@@ -79,11 +79,6 @@ def own_calls(error: BaseException) -> list[traceback.FrameSummary]:
     """The calls in an error's traceback that are in the user's own code."""
     calls = traceback.extract_tb(error.__traceback__)
     return [call for call in calls if not call.filename.startswith(_NOT_OWN)]
-
-
-def is_refused_here(error: BaseException) -> bool:
-    """Whether this project's code raised an error, such as for a value out of range."""
-    return traceback.extract_tb(error.__traceback__)[-1].filename.startswith(_PACKAGE)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict
@@ -25,7 +26,7 @@ from rl_yardstick.pipeline import callbacks
 from rl_yardstick.pipeline.components import action_noise, build, constructor_arguments
 from rl_yardstick.pipeline.environment_trial import tried
 from rl_yardstick.pipeline.environments import first_seed, make_training_env, training_changes
-from rl_yardstick.pipeline.errors import Stopped, UserError, is_refused_here, one_line, own_calls
+from rl_yardstick.pipeline.errors import PACKAGE, Stopped, UserError, one_line, own_calls
 from rl_yardstick.pipeline.evaluation.critics import recorder_of
 from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
@@ -233,7 +234,8 @@ class Training:
 
 def told(error: Exception, where: str) -> Exception:
     """An error of the user's own code with a note of where it was, one of a library in a line."""
-    if own_calls(error) and not is_refused_here(error):
+    *_, raised_in = traceback.extract_tb(error.__traceback__)
+    if own_calls(error) and not raised_in.filename.startswith(PACKAGE):
         error.add_note(where)
     elif isinstance(error, OF_LIBRARIES):
         return UserError(f"{where}: {one_line(error)}")
