@@ -101,7 +101,7 @@ def play(
     while len(steps) <= n_steps and time.monotonic() < until:
         where = f"step {len(steps)}"
         before()
-        action = action if same_action and action is not None else _chosen(env, actions)
+        action = action if same_action and action is not None else chosen(env, actions)
         found.since, begin = time.monotonic(), time.perf_counter()
         outcome = env.step(copy.deepcopy(action))
         seconds = time.perf_counter() - begin
@@ -133,7 +133,7 @@ def digest(value: Any) -> int:
     return hash(array.shape if array.dtype.hasobject else array.tobytes())
 
 
-def _chosen(env: Env, actions: Any) -> Any:
+def chosen(env: Env, actions: Any) -> Any:
     """A random action, a valid one where the environment has masks."""
     masks = action_masks(env)
     if masks is None or not isinstance(actions, spaces.Discrete):

@@ -119,7 +119,7 @@ def model_of(
         told = f"{sum(illegal.values()):,} of the pairs of state and action are not allowed"
         notes.append(f"{told}: {next(iter(illegal))}{others}")
     observations = search.observations * search.times
-    return FoundModel(model, allowed, observations, search.horizon, notes, search.spent)
+    return FoundModel(model, allowed, observations, search.horizon, notes, search.spent())
 
 
 class _Seeded(gym.Wrapper[Any, Any, Any, Any]):

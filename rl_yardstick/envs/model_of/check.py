@@ -13,13 +13,12 @@ import random
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from time import perf_counter, process_time
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from rl_yardstick.envs.model_of.symbols import Limit, seconds_since
+from rl_yardstick.envs.model_of.symbols import Limit, stopwatch
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 STEPS, STEPS_PER_START = 20_000, 40
@@ -74,12 +73,12 @@ def refutation(
         Limit: if it gives up.
     """
     rng = np.random.default_rng([seed, 1])  # no numbers that the environment draws
-    initial, state, time, begin = model.initial, None, 0, (process_time(), perf_counter())
+    initial, state, time, spent = model.initial, None, 0, stopwatch()
     starts: Row = {(s, 0.0): [initial[s], 0.0] for s in np.flatnonzero(initial).tolist()}
     rows = {"reset": starts}
     with seeded_globally(seed):
         for taken, drawn in enumerate(rng.integers(len(actions), size=steps).tolist()):
-            if seconds_since(begin) > seconds:
+            if spent() > seconds:
                 told = f"{steps:,} steps, by which every model is tested, take too long"
                 raise Limit(f"{told}: {taken:,} in {seconds:g} seconds")
             if state is None:

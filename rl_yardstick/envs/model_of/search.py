@@ -13,14 +13,13 @@ import itertools
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
-from time import perf_counter, process_time
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rl_yardstick.envs.model_of.draws import CUT_OFF, NEVER, Again, Script, Suspect, take_step
 from rl_yardstick.envs.model_of.states import Place, Refuted, State
-from rl_yardstick.envs.model_of.symbols import Drawn, Limit, Stop, seconds_since
+from rl_yardstick.envs.model_of.symbols import Drawn, Limit, Stop, stopwatch
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 MOST_ENTRIES = 100_000_000  # of the arrays of a model
@@ -127,12 +126,7 @@ class Search:
     put: Callable[[bool], Any] = bool  # lets draws follow the script, or not
 
     def __post_init__(self) -> None:
-        self.begun = process_time(), perf_counter()
-
-    @property
-    def spent(self) -> float:
-        """Seconds, as of `seconds_since`."""
-        return seconds_since(self.begun)
+        self.spent = stopwatch()
 
     def run(self) -> tuple[TransitionModel, Bools]:
         """The model and the allowed actions, once no guess about the state proves wrong."""
@@ -297,7 +291,7 @@ class Search:
     def _tick(self) -> None:
         """Watch the time, and now and then the constants."""
         self.runs += 1
-        if self.runs % 8 == 0 and self.spent > self.seconds:
+        if self.runs % 8 == 0 and self.spent() > self.seconds:
             done = f"{len(self.saved):,} states found, {len(self.rows):,} of them done; "
             done = done * bool(self.rows) + self._growing()
             raise Limit(f"no end after {self.seconds:g} seconds: {done}")

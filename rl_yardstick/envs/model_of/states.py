@@ -157,9 +157,8 @@ class State:
         self.watched: dict[Place, Any] = {}  # what was last written to ghosts and clocks
         self.constants: dict[Place, Hashable] = {}  # by value
         self.fixed: Saved = []  # the constants of each layer, and what is no state
-        self.kept: dict[int, Any] = {
-            id(layer): layer for layer in self.layers
-        }  # saved by reference
+        self.by_id = {id(layer): layer for layer in self.layers}
+        self.kept: dict[int, Any] = dict(self.by_id)  # objects that are saved by reference
         self.in_short: list[tuple[Any, Any]] = []  # constants that can change in place
         self.is_plain = False  # whether watched attributes have values
 
@@ -226,7 +225,7 @@ class State:
         guessed = {p: value for p, value in self.attributes().items() if p not in self.used}
         self.constants = {p: self.left_alone[p] for p in guessed if p in self.left_alone}
         self.kept = self.parts([guessed[place] for place in self.constants])
-        self.kept |= {id(layer): layer for layer in self.layers}
+        self.kept |= self.by_id
         held_fast = [guessed[place] for place in self.constants]
         shorts = [(v, short(v)) for v in held_fast if not isinstance(v, SIMPLE)]
         self.in_short = [(v, known) for v, known in shorts if len(known) <= MOST_IN_SHORT]
@@ -352,7 +351,7 @@ class State:
 
     def contents(self, variables: Saved) -> list[tuple[Place, Hashable]]:
         """Attributes by value, also those that are saved by reference."""
-        kept, self.kept = self.kept, {id(layer): layer for layer in self.layers}
+        kept, self.kept = self.kept, dict(self.by_id)
         held = [((i, k), v) for i, own in enumerate(variables) for k, v in own.items()]
         found = [(place, self.by_value(value)) for place, value in held]
         self.kept = kept

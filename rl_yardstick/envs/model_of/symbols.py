@@ -36,9 +36,10 @@ class Limit(Stop):
     """The search came to one of its limits."""
 
 
-def seconds_since(begun: tuple[float, float]) -> float:
-    """Of processor time, but at least half of those by the clock: an environment may wait."""
-    return max(process_time() - begun[0], (perf_counter() - begun[1]) / 2)
+def stopwatch() -> Callable[[], float]:
+    """What tells the seconds since: of the processor, but half of the clock's if that is more."""
+    begun = process_time(), perf_counter()
+    return lambda: max(process_time() - begun[0], (perf_counter() - begun[1]) / 2)
 
 
 def where() -> str:
